@@ -156,7 +156,7 @@ class MovedByHand(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One exposure.
+    """One exposure of a scanner, with its time.
 
     Attributes:
         cloud: In ``camera`` [m].

@@ -9,7 +9,7 @@ from typing import Any
 
 
 class FlangeyeError(Exception):
-    """An error that one line explains to the user; ``exit_code`` is the process's."""
+    """An error that one line explains to the user; ``exit_code`` is the process's exit code."""
 
     exit_code = 2
 

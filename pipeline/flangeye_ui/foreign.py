@@ -18,7 +18,7 @@ POLICY = (
 
 
 def address_of(folder: Path, path: Path) -> str:
-    """Return where a file of the folder is served."""
+    """Return the URL at which a file of the folder is served."""
     return "/files/" + quote(path.relative_to(folder).as_posix())
 
 

@@ -39,7 +39,7 @@ PUBLISHED = {
 
 
 def add(project: Project) -> None:
-    """Serve the shapes."""
+    """Serve the meshes of the scene."""
 
     @lru_cache(maxsize=8)
     def arm(text: str, q: str) -> bytes | None:
@@ -69,7 +69,7 @@ def add(project: Project) -> None:
 
 
 def address_of_arm(joints: Floats) -> str:
-    """Return where the mesh of the recipe's arm with these joint values is served."""
+    """Return the URL of the mesh of the recipe's arm at these joint values."""
     return "shapes/arm.stl?q=" + ",".join(f"{x:.5f}" for x in joints)
 
 

@@ -137,7 +137,7 @@ class SimulatedRobot(Device):
         self._stopped_by = ""
 
     def close(self) -> None:
-        """Stop."""
+        """Stop the arm."""
         self.stop()
 
     def _begin(self, plan: Plan) -> None:

@@ -35,7 +35,7 @@ def controller_as_printed(task: FollowingTask) -> Controller:
 
 
 class AsPrinted:
-    """The paper's controller.
+    """The paper's seam-following controller, as printed.
 
     Attributes:
         mode: Name in messages and reports.

@@ -67,7 +67,7 @@ def realised(session: SessionRow) -> dict[str, Any]:
 
 
 def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
-    """Return how fast each error of a method grows with the noise, and how it takes outliers."""
+    """Return each error's slope over the noise, and its change with outliers, of a method."""
     clean = [r for r in rows if r["method"] == method and r["outliers"] == 0]
     gross = [r for r in rows if r["method"] == method and r["outliers"] > 0]
     over = [r["workspace_rms"] / r["workspace_bound"] for r in clean]

@@ -127,7 +127,7 @@ def _errors(session: SessionRow) -> dict[str, float]:
 
 
 def _stored_row(recording: CentreSet, archive: Path, session: SessionRow, kept: set[str]) -> Row:
-    """Return how the authors' 50 stored answers do on all poses, those of their pools included."""
+    """Return the errors of the authors' 50 stored answers on all poses, their pools included."""
     matrices, _ = stored_results(archive, recording.stored or "")
     poses = [o for o in session.result()["observations"] if o["centre_in_camera"]]
     centres = np.array([o["centre_in_camera"] for o in poses])

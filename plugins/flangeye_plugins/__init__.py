@@ -110,7 +110,7 @@ def flangeye_parts() -> Mapping[str, str]:
 
 
 def _places(*modules: str) -> dict[str, str]:
-    """Return where plugins are, from lines of a module and its functions.
+    """Return the import paths of plugins, from lines of a module and its functions.
 
     A plugin's kind is the first word of its module; its name may be that of its function alone.
     """
@@ -124,13 +124,13 @@ def _places(*modules: str) -> dict[str, str]:
 
 
 def _all_of(place: str, kind: str, names: str) -> dict[str, str]:
-    """Return where plugins of a kind are that a module has in one tuple."""
+    """Return the import paths of plugins of a kind that a module has in one tuple."""
     return {f"{kind}.{name}": f"flangeye_plugins.{place}" for name in names.split()}
 
 
 @hookimpl
 def flangeye_graphs() -> Mapping[str, Callable[[], Graph]]:
-    """Offer ROS 2."""
+    """Return the ROS 2 graph, by its name."""
     return {"ros2": _ros2}
 
 

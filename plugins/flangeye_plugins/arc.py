@@ -113,7 +113,7 @@ class UrDigitalArc(Device):
             self._set(self._params.gas, on)
 
     def burn(self, on: bool) -> None:
-        """Switch the arc."""
+        """Switch the arc on or off."""
         self._set(self._params.output, on)
 
     def burning(self) -> bool | None:

@@ -154,7 +154,7 @@ class _Arm:
 
 
 def _summary_lines(found: Calibration, measured: bool) -> list[str]:
-    """Return what was found, as text."""
+    """Return the guide's results as lines of text."""
     noise = ", ".join(f"{x * 1e3:.4f}" for x in found.noise)
     rest = ", ".join(f"{x * 1e3:.3f}" for x in found.rest)
     lines = [f"rest       tag at ({rest}) mm in the camera", f"noise      {noise} mm of the tip"]
@@ -262,7 +262,7 @@ class HandGuide:
         return pivot("tip", poses, displaced)
 
     def torch(self) -> Pivot:
-        """Return where the torch's end is."""
+        """Return the position of the torch's end."""
         poses = []
         for attitude in ATTITUDES:
             self._ask(f"Bring the torch's end to the mark, not pressing, the tool {attitude}")

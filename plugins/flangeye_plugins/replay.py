@@ -56,7 +56,7 @@ class WeldReplay(LoggedWeld):
         super().take(note)
 
     def account(self) -> ReplayedStep:
-        """Return how the repeated decisions compare with the logged ones."""
+        """Return the comparison of the repeated decisions with the logged ones."""
         # Commands that differ by less are the same [m/s, rad/s]; other processors round otherwise
         return ReplayedStep(
             what=f"{self.cycles} cycles from {len(self.felt)} images",

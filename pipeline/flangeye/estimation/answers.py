@@ -126,12 +126,12 @@ class _Commands:
 
     @cached_property
     def _of_arm(self) -> Floats:
-        """(W, 6, K) how the arms' errors move the sighted targets."""
+        """Twists (W, 6, K) of the sighted targets for unit weights of the arms' errors."""
         return self._columns(self._linear, "of_arm")
 
     @cached_property
     def _of_camera(self) -> Floats:
-        """(W, 6, K) how a camera's errors move the sighted targets."""
+        """Twists (W, 6, K) of the sighted targets for unit weights of a camera's errors."""
         return self._columns(self._linear, "of_camera")
 
     def _columns(self, linear: Linear, whose: Literal["of_arm", "of_camera"]) -> Floats:
@@ -146,7 +146,7 @@ class _Commands:
 
     @cached_property
     def _rigid_parts(self) -> dict[str, Floats]:
-        """(B, 6, K) rigid motion of each carrier's frame, about its arm base's origin."""
+        """Rigid motion (B, 6, K) of each carrier's frame, about its arm base's origin."""
         still, out = np.zeros((len(self.work.seen), 6, 6)), {}
         for carrier in self.work.carriers:
             blocks = {c.frame: still + np.eye(6) * (c is carrier) for c in self.work.carriers}
@@ -168,7 +168,7 @@ class _Commands:
 
     @property
     def _world(self) -> Floats:
-        """(B, 6, K) rotation and shift of the root's reported coordinates."""
+        """Rotation and shift (B, 6, K) of the root's reported coordinates."""
         parts = []
         for carrier in self.work.carriers:
             path = chain(self.work.frames, carrier.frame)[:-1]
@@ -238,7 +238,7 @@ class _Commands:
 
 
 def adjoint(pose: Floats) -> Floats:
-    """Return (6, 6) that converts a twist about a frame's origin to its parent's."""
+    """Return the adjoint (6, 6) that takes a twist at a frame's origin to its parent's."""
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = pose[:3, :3]
     out[3:, :3] = hat(pose[:3, 3]) @ pose[:3, :3]

@@ -43,7 +43,7 @@ class ArmParameters:
 
     @property
     def identified(self) -> Mask:
-        """(n, 4) which parameters the poses identify singly."""
+        """Mask (n, 4) of the parameters that the poses identify singly."""
         singly = np.diag(self.alone).reshape(self.sizes.shape) <= KNOWN**2
         return np.asarray(singly & (self.deviations <= KNOWN * self.sizes))
 

@@ -62,13 +62,13 @@ class Sightings:
 
     @property
     def ranks(self) -> Indices:
-        """(N,) how many numbers each measured: 6 for a pose, 5 with a normal, 3 for a centre."""
+        """Rank (N,) of each measurement: 6 for a pose, 5 with a normal, 3 for a centre."""
         traces = np.trace(self.projectors, axis1=1, axis2=2)
         return np.asarray(traces.round(), dtype=np.intp)
 
     @property
     def poses(self) -> Floats:
-        """(N, 4, 4) camera_T_target."""
+        """Measured poses (N, 4, 4) ``camera_T_target``."""
         out = np.zeros((len(self), 4, 4))
         out[:, :3, :3], out[:, :3, 3], out[:, 3, 3] = self.rotations, self.centres, 1.0
         return out

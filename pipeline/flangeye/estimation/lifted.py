@@ -184,7 +184,7 @@ class Quadratic:
 
     @cached_property
     def root(self) -> Floats:
-        """(n, n) matrix R with R'R equal to the quadratic."""
+        """Square root (n, n): matrix R with R'R equal to the quadratic."""
         values, vectors = np.linalg.eigh(self.quadratic)
         return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 

@@ -464,7 +464,7 @@ def _refusal(
     weak: WeakModes,
     freedoms: Mapping[str, Floats] | None,
 ) -> str:
-    """Return which frames are not observable, and the motions or sightings that would help."""
+    """Return the message on frames that are not observable, and what would make them so."""
     information, scale = known
     named = _named(problem, weak, scale)
     share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))

@@ -65,7 +65,7 @@ class Preview:
 
     @property
     def errors(self) -> Floats:
-        """(N, 6) leave-one-out residuals of each sighting [rad, m]."""
+        """Leave-one-out residuals (N, 6) of each sighting [rad, m]."""
         return left_out(self.model, self.fit)[0]
 
     @property

@@ -72,7 +72,7 @@ def begin(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
 
 
 def agreeing(problem: Problem, squares: Floats) -> Mask:
-    """Return (N,) which sightings are consistent with a guess, by their squared distances."""
+    """Return the mask (N,) of sightings consistent with a guess, by squared distances."""
     return np.asarray(squares <= GOOD * np.maximum(_middles(problem, squares), 1.0))
 
 

@@ -75,7 +75,7 @@ def _foreseen(work: Problem, places: Places) -> Problem:
 
 
 def _inside(work: Problem, box: Floats) -> Mask:
-    """Return (W,) which sightings have the flange in a box (2, 3); all if none have."""
+    """Return the mask (W,) of sightings with the flange in a box (2, 3); all if none have."""
     places = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times, :3, 3]
     inside = np.asarray(((places >= box[0]) & (places <= box[1])).all(axis=1))
     return inside if inside.any() else ~inside

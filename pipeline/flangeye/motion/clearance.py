@@ -56,7 +56,7 @@ class ArmVolume:
         return bool((segment_distance(axes, segment) > self.radii + room).all())
 
     def hides(self, axes: Floats, sight: Floats) -> Mask:
-        """Return (S,) which lines of sight (S, 2, 3) are crossed by a link other than the last."""
+        """Return the mask (S,) of lines of sight (S, 2, 3) that a link before the last crosses."""
         before = self._before
         gaps = segment_distance(axes[before, None], sight[None])
         return np.asarray((gaps < self.radii[before, None]).any(axis=0))

@@ -32,7 +32,7 @@ class MotionLimits:
     upper: Floats
 
     def outside(self, place: Floats, slack: float = 0.0) -> str | None:
-        """Return how a place (3,) in ``base`` is outside the box by more than ``slack`` [m]."""
+        """Return a text if a place (3,) in ``base`` is more than ``slack`` [m] outside the box."""
         box = (place.tolist(), self.low.tolist(), self.high.tolist())  # floats: 500 times a second
         for axis, value, low, high in zip("xyz", *box, strict=True):
             if not low - slack <= value <= high + slack:
@@ -43,7 +43,7 @@ class MotionLimits:
         return None
 
     def beyond(self, joints: Floats, margin: float = 0.0) -> str | None:
-        """Return which of (n,) joint angles is nearer than ``margin`` [rad] to its limit."""
+        """Return a text on a joint of (n,) that is nearer than ``margin`` [rad] to its limit."""
         room = np.minimum(joints - self.lower, self.upper - joints)
         joint = int(np.argmin(room))
         if room[joint] >= margin:

@@ -65,7 +65,7 @@ class Reach:
         target: float | TargetBody,
         margins: Margins | None = None,
     ) -> None:
-        """Set up.
+        """Prepare the search.
 
         Args:
             robot: The arm.
@@ -101,7 +101,7 @@ class Reach:
         self._eyes += base_T_camera[:3, 3]
 
     def why_refused(self) -> str:
-        """Return why poses were impossible, and how often; empty where all were possible."""
+        """Return the reasons why poses were impossible, with counts; empty if all were possible."""
         counts = Counter(refusal.reason for refusal in self.refusals).most_common()
         return ", ".join(f"{count} {reason}" for reason, count in counts)
 
@@ -199,7 +199,7 @@ class Reach:
         return bool(self._inside(rim @ base_T_flange[:3, :3].T + base_T_flange[:3, 3]).all())
 
     def _inside(self, in_base: Floats) -> Mask:
-        """Return (N,) which points (N, 3) camera and projector have in their fields and range."""
+        """Return the mask (N,) of points (N, 3) in the fields and range of camera and projector."""
         in_camera = (in_base - self._base_T_camera[:3, 3]) @ self._base_T_camera[:3, :3]
         scanner, depth = self._scanner, in_camera[:, 2]
         turn = rotation_from_rpy(0.0, -2 * scanner.convergence, 0.0)
@@ -238,7 +238,7 @@ class Reach:
         return self._seen(joints)[1] >= 0.6
 
     def _why_not(self, reachable: Floats) -> str:
-        """Return why none of (K, n) postures is allowed."""
+        """Return the reason why none of the postures (K, n) is allowed."""
         clear = next((joints for joints in reachable if self._clear(joints)), None)
         if clear is not None:
             return self._too_near(clear) or "with too little of the body in view"
@@ -297,7 +297,7 @@ def _turn(first: Floats, second: Floats) -> float:
 
 
 def _within(points: Floats, field: tuple[float, float]) -> Mask:
-    """Return (N,) which of (N, 3) points before a pinhole lie in its field, with a margin."""
+    """Return the mask (N,) of points (N, 3) in a pinhole's field of view, with a margin."""
     # Share of the field of view, to either side, that a planned target keeps to
     view_share = 0.95
     half = np.tan(np.asarray(field) / 2) * view_share
@@ -339,7 +339,7 @@ class PlannedPose(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Poses to visit.
+    """Poses to visit, in their order.
 
     Attributes:
         poses: In the order of their visit; a plan may choose each when it is asked for.

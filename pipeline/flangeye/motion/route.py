@@ -91,7 +91,7 @@ class Router:
         return self._timed(start, goal, finer * count)
 
     def _bars(self, joints: Floats, frames: Floats, place: Floats) -> str | None:
-        """Return why the arm must not be in a posture; None if it may."""
+        """Return the reason why a posture is forbidden; None if it is allowed."""
         axes = self._volume.axes(frames)
         if not self._volume.above(axes, TABLE):
             return f"touches the table with the flange at {in_mm(place)}"

@@ -39,7 +39,7 @@ class ToolPose:
 
     @cached_property
     def direction(self) -> Floats:
-        """(2,) t_d: from the torch to the tip."""
+        """Direction (2,) from the torch to the tip, the paper's t_d."""
         return np.array([math.cos(self.angle), math.sin(self.angle)])
 
 
@@ -122,7 +122,7 @@ class Controller(Protocol):
 
     @property
     def reason(self) -> str:
-        """Why it stopped."""
+        """Reason why the controller stopped."""
 
     @property
     def tip(self) -> float:

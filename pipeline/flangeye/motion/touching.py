@@ -38,7 +38,7 @@ class Touched:
 
     @property
     def error(self) -> Floats:
-        """(3,) predicted less actual [m]."""
+        """Predicted minus actual position (3,) [m]."""
         return np.asarray(self.predicted - self.actual)
 
 

@@ -119,7 +119,7 @@ def guard(wire: Connection, charge: GuardConfig) -> None:
 
 
 class Watchdog:
-    """Guards one arm."""
+    """Process that stops one arm when commands or this program fail."""
 
     def __init__(self, robot: Robot, wire: Connection, charge: GuardConfig) -> None:
         self._robot, self._wire, self._charge = robot, wire, charge

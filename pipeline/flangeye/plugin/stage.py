@@ -57,7 +57,7 @@ class PlaceParams(Params):
 
     @property
     def matrix(self) -> t.Floats:
-        """(4, 4), translation in [m]."""
+        """Matrix (4, 4) of the transform, translation in [m]."""
         return rigid(rotation_from_rpy(*self.rpy), np.asarray(self.position))
 
 
@@ -210,7 +210,7 @@ class Plugin:
 
     @property
     def documentation(self) -> str:
-        """The whole docstring."""
+        """Whole docstring of the stage's function."""
         return inspect.getdoc(self.function) or ""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:

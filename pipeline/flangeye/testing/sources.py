@@ -243,7 +243,7 @@ class ViewConformance(Conformance):
     kind = "view"
 
     def guess(self) -> Floats:
-        """Return the guess."""
+        """Return the part's guess of ``base_T_camera`` (4, 4) [m]."""
         return np.asarray(self.call({}, Arm(self.robot), self.scanner), dtype=float)
 
     def test_it_gives_the_same_twice(self) -> None:

@@ -307,13 +307,13 @@ class Seam:
 
     @property
     def arc_length(self) -> Floats:
-        """(N,) way along the seam from its start to each point [m]."""
+        """Arc length (N,) from the seam's start to each point [m]."""
         steps = np.linalg.norm(np.diff(self.points_in_base, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     @property
     def tangents(self) -> Floats:
-        """(N, 3) unit vectors along the seam, in the direction of welding."""
+        """Unit vectors (N, 3) along the seam, in the direction of welding."""
         along = np.gradient(self.points_in_base, self.arc_length, axis=0)
         return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
@@ -388,7 +388,7 @@ class WeldReport:
 
     @property
     def opening(self) -> Array:
-        """(3,) the openings' mean direction, for a view of the seam."""
+        """Mean direction (3,) of the openings, for a view of the seam."""
         mean = self.openings.mean(axis=0)
         return np.asarray(mean / np.linalg.norm(mean))
 

@@ -84,7 +84,7 @@ class ArmCorrection:
 
     @property
     def of_arm(self) -> bool:
-        """Whether it corrects the arm, not only the circle's place on the flange."""
+        """Whether the correction changes the arm, not only the circle's place on the flange."""
         return self.joint_offsets is not None or self.field is not None
 
 
@@ -220,7 +220,7 @@ class PoseError:
         freeze(self, motion=(4, 4), at=(3,), base_R_camera=(3, 3))
 
     def displacement(self, at: Floats | None = None) -> Floats:
-        """Return (3,) by how much it moves a place, by default the work, in ``camera`` [m]."""
+        """Return the displacement (3,) of a place, by default the work, in ``camera`` [m]."""
         at = self.at if at is None else at
         return np.asarray(self.motion[:3, :3] @ at + self.motion[:3, 3] - at)
 

@@ -53,7 +53,7 @@ class CircleFeature:
 
     @property
     def centre_covariance(self) -> Floats:
-        """(3, 3) covariance of the centre [m^2]; every feature has one."""
+        """Covariance (3, 3) of the centre [m^2]; every feature has one."""
         return self.covariance
 
 
@@ -87,22 +87,22 @@ class PoseFeature:
 
     @property
     def centre(self) -> Floats:
-        """(3,) the target's origin in ``camera`` [m]."""
+        """Target's origin (3,) in ``camera`` [m]."""
         return self.camera_T_target.translation
 
     @property
     def normal(self) -> Floats:
-        """(3,) the target's z in ``camera``."""
+        """Target's z axis (3,) in ``camera``."""
         return self.camera_T_target.rotation[:, 2]
 
     @property
     def centre_covariance(self) -> Floats:
-        """(3, 3) of the origin [m^2]."""
+        """Covariance (3, 3) of the origin [m^2]."""
         return self.covariance[3:, 3:]
 
     @property
     def normal_covariance(self) -> Floats:
-        """(3, 3) of the target's z, singular along it."""
+        """Covariance (3, 3) of the target's z axis, singular along it."""
         turned = np.cross(self.normal, self.covariance[:3, :3])
         return np.cross(self.normal, turned.T)
 
@@ -180,13 +180,13 @@ class Observation(Placed):
 
     @property
     def centre_in_mount(self) -> Floats:
-        """(3,) the target in the link that carries it, if that is known [m]."""
+        """Target's position (3,) in the link that carries it [m], if known."""
         feature = self.feature
         return feature.centre_in_flange if isinstance(feature, CircleFeature) else np.zeros(3)
 
     @property
     def tcp_in_base(self) -> Floats:
-        """(3,) the flange's centre, or the carried target, as the controller reports it [m]."""
+        """Reported position (3,) of the flange's centre, or of the carried target [m]."""
         return self.base_T_flange.apply(self.centre_in_mount)
 
 

@@ -115,12 +115,12 @@ class Transform:
 
     @property
     def rotation(self) -> Floats:
-        """(3, 3) rotation ``parent_R_child``."""
+        """Rotation ``parent_R_child`` (3, 3)."""
         return self.matrix[:3, :3]
 
     @property
     def translation(self) -> Floats:
-        """(3,) origin of ``child`` in ``parent`` [m]."""
+        """Origin (3,) of ``child`` in ``parent`` [m]."""
         return self.matrix[:3, 3]
 
     def __matmul__(self, other: Transform) -> Transform:

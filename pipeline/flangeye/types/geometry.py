@@ -77,7 +77,7 @@ def rotation_log(rotation: Floats) -> Floats:
 
 
 def _skew_part(r: Floats) -> Floats:
-    """Return (..., 3) what a (..., 3, 3) matrix has more below its diagonal than above."""
+    """Return the vector (..., 3) of the differences of opposite entries of (..., 3, 3)."""
     return np.stack(
         [
             r[..., 2, 1] - r[..., 1, 2],

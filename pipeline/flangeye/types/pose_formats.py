@@ -361,7 +361,7 @@ def is_known(rotation: object) -> bool:
 
 
 def plain_rotation(rotation: str) -> str:
-    """Return how a maker writes rotations; what is not a maker's name stays as it is."""
+    """Return a maker's rotation convention; other names are returned unchanged."""
     return CONVENTIONS[rotation].rotation if rotation in CONVENTIONS else rotation
 
 

@@ -109,7 +109,7 @@ class FlangeCloud:
 
     @property
     def alone(self) -> list[FlangeCloud]:
-        """It with each pose that explains the scan alone."""
+        """The fit with each single pose that explains the scan."""
         poses = (self.camera_T_target, *self.others)
         return [replace(self, camera_T_target=each, others=self.others[:0]) for each in poses]
 

@@ -135,7 +135,7 @@ class AuboController(ControlUnit):
         return OK
 
     def emergency_stop(self, why: str) -> None:
-        """Cut the power."""
+        """Cut the arm's power, as the emergency stop does."""
         self.note(f"emergency stop: {why}")
         self.safety = "RobotEmergencyStop"
         self.power_off()
@@ -177,7 +177,7 @@ def serve(options: EmulatorOptions) -> None:
 
 
 class RpcSession(Connection):
-    """One client."""
+    """Connection of one client of the RPC port."""
 
     def __init__(self, network: Network, box: AuboController) -> None:
         super().__init__(network)

@@ -60,7 +60,7 @@ class Pixels:
 
     @property
     def directions(self) -> Image:
-        """(H, W, 3) directions of all rays, with z = 1."""
+        """Directions (H, W, 3) of all rays, with z = 1."""
         x, y = np.meshgrid(self.x, self.y)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 

@@ -397,7 +397,7 @@ class StructuredLight(DepthCamera):
         return np.asarray((np.abs(aside) <= half_x * ahead) & (np.abs(y) <= half_y * ahead))
 
     def _view(self, scene: RaycastScene, hits: Hits, to_light: Image, rows: slice) -> _View:
-        """Return what is seen in a slice of rows.
+        """Return the depth view of a slice of rows.
 
         Args:
             scene: Bodies in ``camera``.

@@ -35,7 +35,7 @@ completely unknown rotation has 1.8, but the linearisation does not reach that f
 
 
 class _Equations(NamedTuple):
-    """Linearised residuals.
+    """Linearised residuals of the fit.
 
     The 14 columns are rotation [rad], translation [sizes of the body], lost width by direction of
     the edge [m], rounding, and the body's scale.

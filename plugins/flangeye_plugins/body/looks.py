@@ -43,13 +43,13 @@ class Looks(Shape):
 
     @cached_property
     def views(self) -> Floats:
-        """(V, 3) viewing directions, from the scanner to the body."""
+        """Viewing directions (V, 3), from the scanner to the body."""
         # 128 directions, about 20 degrees apart, are enough for occlusions
         return spread_directions(128)
 
     @cached_property
     def _seen(self) -> tuple[Mask, Mask]:
-        """(V, N) masks of the surface points and of the ends that are visible from each direction.
+        """Masks (V, N) of surface points and of edge points visible from each direction.
 
         Only ends with free space or distant background behind them count.
         """
@@ -61,12 +61,12 @@ class Looks(Shape):
 
     @property
     def ends_seen(self) -> Mask:
-        """(V, N) mask of the ends that are visible from each direction."""
+        """Mask (V, N) of the edge points visible from each direction."""
         return self._seen[1]
 
     @cached_property
     def _listed(self) -> tuple[Indices, Indices]:
-        """(V, LISTED) indices of sampled visible surface points, and of sampled visible ends."""
+        """Indices (V, LISTED) of sampled visible surface points, and of sampled edge points."""
         # -0.4: a coarse view often misses surfaces at larger incidence than 66 degrees
         on, ends = (
             _apart(part.points, seen & (self.views @ part.normals.T < -0.4))

@@ -55,7 +55,7 @@ class Crossings:
 
     @cached_property
     def normals(self) -> Floats:
-        """(N, 3) unit normals of the smoothed surface, towards the ray's origin."""
+        """Unit normals (N, 3) of the smoothed surface, towards the ray's origin."""
         mesh, smooth = self.shape._smooth
         weights = np.column_stack([1 - self.uv.sum(axis=1), self.uv])
         normals = np.einsum("nk,nkc->nc", weights, smooth[mesh.faces[self.facets]])
@@ -97,13 +97,13 @@ class Shape:
 
     @cached_property
     def centre(self) -> Floats:
-        """(3,) centre of that bounding box [m]."""
+        """Centre (3,) of the body's bounding box [m]."""
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return np.asarray((low + high) / 2)
 
     @cached_property
     def hull(self) -> Indices:
-        """(H,) indices of the vertices of the convex hull."""
+        """Indices (H,) of the vertices of the convex hull."""
         from scipy.spatial import ConvexHull
 
         return np.asarray(ConvexHull(self.vertices, qhull_options="QJ").vertices)

@@ -28,12 +28,12 @@ class CoarseImage:
 
     @property
     def depth(self) -> Floats:
-        """(H, W) depth along z [m]."""
+        """Depth (H, W) along z [m]."""
         return self.xyz[..., 2]
 
     @property
     def directions(self) -> Floats:
-        """(H, W, 3) directions of the rays through the cells' centres, with z = 1."""
+        """Directions (H, W, 3) of the rays through the cells' centres, with z = 1."""
         rows, columns = self.xyz.shape[:2]
         x = self.low[0] + (np.arange(columns) + 0.5) * self.angle
         y = self.low[1] + (np.arange(rows) + 0.5) * self.angle
@@ -52,7 +52,7 @@ class CoarseImage:
 
     @cached_property
     def normals(self) -> Floats:
-        """(H, W, 3) unit normals towards the scanner; NaN with too few neighbours."""
+        """Unit normals (H, W, 3) towards the scanner; NaN with too few neighbours."""
         down, across = _slope(self.xyz, 0, self.angle), _slope(self.xyz, 1, self.angle)
         rough = _unit(np.cross(across, down))
         rough = _facing(rough, self.xyz)
@@ -85,7 +85,7 @@ class CoarseImage:
 
     @cached_property
     def nearest_end(self) -> Indices:
-        """(H, W) flat index of the nearest cell at an edge; the cell's own if there is none."""
+        """Flat index (H, W) of the nearest cell at an edge; the cell's own if there is none."""
         from scipy.ndimage import distance_transform_edt
 
         found = self.ends[0]
@@ -96,7 +96,7 @@ class CoarseImage:
 
     @cached_property
     def _to_ends(self) -> Singles:
-        """(H W, 6) position and direction of the edge nearest to each cell; NaN without one."""
+        """Position and direction (H W, 6) of the edge nearest to each cell; NaN without one."""
         found, directions = self.ends
         both = np.concatenate([self.xyz, directions], axis=-1)
         both[~found] = np.nan
@@ -104,7 +104,7 @@ class CoarseImage:
 
     @cached_property
     def _surfaces(self) -> Singles:
-        """(H W, 6) positions and normals of the cells, in single precision for speed."""
+        """Positions and normals (H W, 6) of the cells, in single precision for speed."""
         return np.concatenate([self.xyz, self.normals], axis=-1).reshape(-1, 6).astype(np.float32)
 
     def to_end(self, placed: Floats, outwards: Floats) -> tuple[Floats, Floats]:

@@ -75,7 +75,7 @@ class VariantFits:
 
     @property
     def lengths(self) -> Floats:
-        """(K, N, B) of every residual [m, rad]."""
+        """Length (K, N, B) of every residual [m, rad]."""
         return np.stack([np.linalg.norm(r, axis=-1) for r in self.residuals], axis=-1)
 
 

@@ -68,7 +68,7 @@ def _without(session: RecordedSession, null: VariantFits, index: int) -> Signifi
 
 
 def _dimensions(null: VariantFits) -> Floats:
-    """Return (B,) how many coordinates each kind of error has, from how many there are in all."""
+    """Return the number of coordinates (B,) of each kind of error, from their total."""
     rest = int(null.count[0] / np.isfinite(null.lengths[0, :, 0]).sum()) - 3
     return np.array([3.0, rest]) if len(null.residuals) > 1 else np.array([3.0])
 
@@ -145,7 +145,7 @@ def _positions_alone(session: RecordedSession) -> RecordedSession | None:
 def _flipped(
     session: RecordedSession, null: VariantFits
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
-    """Return (N,) which flip each sample shows, -1 for none."""
+    """Return the index (N,) of the flip that each sample shows, -1 for none."""
     unknowns = null.unknowns
     mounts = equations_of(session).carried(unknowns.other)[0, :, :3, :3]
     expected = mounts @ unknowns.turn[0]

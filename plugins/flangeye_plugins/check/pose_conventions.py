@@ -172,7 +172,7 @@ def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
 
 
 def _stated(session: RecordedSession, of: str | None = None) -> str | None:
-    """Return how the recipe states the arm's rotations are written, or the target's, if it does."""
+    """Return the recipe's stated convention of the arm's or target's rotations, if any."""
     said = _said(session, of)
     return said and plain_rotation(said[0])
 
@@ -283,7 +283,7 @@ def _with_exchanged_columns(session: RecordedSession) -> Iterator[tuple[str, str
 
 
 def _distances(session: RecordedSession) -> tuple[float, float]:
-    """Return how far from the flange the one is, and from the base the other [m]."""
+    """Return the distances of one from the flange, and of the other from the base [m]."""
     found = fit_of(session).unknowns
     near, far = found.place[0].mean(axis=0), found.position[0]
     if session.carried == "camera":

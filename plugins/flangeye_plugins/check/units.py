@@ -246,7 +246,7 @@ def size(session: RecordedSession) -> Findings:
 
 
 def _wrong_marker(session: RecordedSession, kind: str, factor: float) -> tuple[str, str]:
-    """Return what is wrong with a marker or its camera, and what to do."""
+    """Return the finding on a wrong marker or camera, with what to do."""
     calibrate = _calibrate_camera(session)
     focal = f"the camera's focal length is {factor:.4f} times as long as its calibration states"
     if kind == "focal":

@@ -299,7 +299,7 @@ class Ros2Graph(Device):
         return str(decoded(latched.data, Type.TEXT).data)
 
     def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
-        """Return what all topics of arms and cameras sent in a short time."""
+        """Return the samples that all topics of arms and cameras sent in a short time."""
         some = [t for t in topics if t.publishers and t.type in (Type.JOINT_STATE, *SCANS)]
         joints: dict[str, dict[str, float]] = {topic.name: {} for topic in some}
 

@@ -297,7 +297,7 @@ def _unlikely(disc: Disc, other: float | None, flange: Flange) -> str | None:
 
 
 def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
-    """Return what is wrong with the plate in front of a wrist circle; None if nothing is."""
+    """Return the reason why the plate before a wrist circle is wrong; None if it fits."""
     if flange.bore is not None:
         return None
     around = nearby[np.abs(disc.plane.heights(nearby)) < 2 * flange.details.thickness]

@@ -189,7 +189,7 @@ class SeamReach:
         return np.asarray(chain + np.where(allowed, turns, 0.0))
 
     def _bars(self, before: Floats, joints: Floats) -> Barrier | None:
-        """Return why a posture is not allowed after another one; None if it is."""
+        """Return the reason why a posture cannot follow another one; None if it can."""
         # The order matters: the message is that of the attempt that passes most checks
         axes = self._volume.axes(self._arm.frames(joints))
         if not self._volume.above(axes, TABLE):

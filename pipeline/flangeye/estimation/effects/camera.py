@@ -77,7 +77,7 @@ def _smoothed(problem: Problem, linear: Linear, whose: Mask) -> Floats:
 
 
 def drift_effects(problem: Problem) -> list[Effect]:
-    """Return how each camera drifts: shifts and turns, piecewise linear in time.
+    """Return effects of each camera's drift: shifts and turns, piecewise linear in time.
 
     The target may be what drifted instead.
     """

@@ -138,7 +138,7 @@ class DistortionField:
         return np.concatenate([turned, self.at(s.centres)], axis=1)
 
     def at(self, points: Floats) -> Floats:
-        """Return (N, 3, K) by how much each weight moves points (N, 3) of the view [m]."""
+        """Return displacements (N, 3, K) [m] of points (N, 3) of the view for each unit weight."""
         rigid, scale = self._over_volume
         return np.asarray(scale * (self._raw(points) - self._motions(points) @ rigid))
 

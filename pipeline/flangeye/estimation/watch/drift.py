@@ -153,12 +153,12 @@ class Information:
 
     @property
     def covariance(self) -> Floats:
-        """(6 + K, 6 + K) covariance; zero along directions that no sighting shows, by pinv."""
+        """Covariance (6 + K, 6 + K); zero along directions that no sighting shows, by pinv."""
         return np.asarray(np.linalg.pinv(self.matrix, hermitian=True))
 
     @property
     def mean(self) -> Floats:
-        """(6 + K,) the motion and the weights."""
+        """Mean (6 + K,) of the motion and the weights."""
         return np.asarray(self.covariance @ self.vector)
 
 
@@ -255,7 +255,7 @@ def moved_since(
 
 
 def misfits(sightings: CheckSightings, before: Information, test: DriftTest) -> NDArray[np.bool_]:
-    """Return (N,) which sightings are outliers if nothing moved."""
+    """Return the mask (N,) of sightings that are outliers if nothing moved."""
     effects = sightings.effects
     spread = effects @ before.covariance @ effects.transpose(0, 2, 1) + sightings.covariances
     motions = effects[..., :6]

@@ -62,17 +62,17 @@ class ArmPoseErrors:
 
     @property
     def variances(self) -> Floats:
-        """(K,) prior variances of the weights."""
+        """Prior variances (K,) of the weights."""
         return np.repeat(np.square(self.smooth), 3 * len(POWERS))
 
     @property
     def with_camera(self) -> Floats:
-        """(6 + K,) variances of a free motion of the camera [rad^2, m^2], and of the weights."""
+        """Variances (6 + K,) of a free motion of the camera [rad^2, m^2], and of the weights."""
         return np.concatenate([np.ones(6), self.variances])
 
     @property
     def beyond(self) -> Floats:
-        """(5, 5) covariance of the noise."""
+        """Covariance (5, 5) of the noise."""
         return np.diag(np.repeat(np.square(self.noise), (3, 2)))
 
 

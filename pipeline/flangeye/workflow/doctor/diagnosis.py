@@ -98,7 +98,7 @@ class RecordedSession:
 
     @property
     def seen(self) -> Mask:
-        """(N,) whether the target was measured."""
+        """Mask (N,) of the samples in which the target was measured."""
         return np.asarray(np.isfinite(self.centres[:, 0]))
 
     @property
@@ -216,7 +216,7 @@ class Misfit(NamedTuple):
 
     @property
     def numbers(self) -> Floats:
-        """(1,) or (2,) the errors that exist."""
+        """Errors that exist, (1,) or (2,)."""
         return np.array([x for x in self if x is not None])
 
 

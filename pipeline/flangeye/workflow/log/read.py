@@ -280,7 +280,7 @@ class RunLog:
 
     @property
     def last_joints(self) -> Any:
-        """(n,) joint angles at the last capture [rad]; None if unknown."""
+        """Joint angles (n,) at the last capture [rad]; None if unknown."""
         return self._pose(next(reversed(self.poses)))[1] if self.poses else None
 
     def _pose(self, capture: str) -> tuple[t.Poses, Any]:

@@ -87,7 +87,7 @@ class Recorder:
     """
 
     def __init__(self, path: Path, recipe: dict[str, str], full_clouds: bool) -> None:
-        """Create the file.
+        """Create the log file.
 
         Args:
             path: File to create.

@@ -227,7 +227,7 @@ class FittedFeature:
 
     @cached_property
     def xyz(self) -> Floats:
-        """(N, 3) the cloud in these axes, from the circle's centre [m]; few are asked for."""
+        """Points (N, 3) of the cloud in these axes, from the circle's centre [m]."""
         return (self.cloud.xyz.astype(np.float64) - self.circle.centre) @ self.axes.T
 
     @property

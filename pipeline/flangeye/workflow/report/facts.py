@@ -78,7 +78,7 @@ class Facts:
 
     @property
     def base_T_camera(self) -> t.Array | None:
-        """(4, 4) camera pose in the base; None if another transform was estimated."""
+        """Camera's pose (4, 4) in the base; None if another transform was estimated."""
         found = self.result.transforms.get("base_T_camera")
         return None if found is None else np.array(found.matrix)
 

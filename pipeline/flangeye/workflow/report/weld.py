@@ -148,7 +148,7 @@ def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figu
 def _beside(
     plane: WeldPlane, line: Floats, torch: Floats
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return where a torch (N, 3) is along a seam and to its left [m], and the (N,) beside it."""
+    """Return the torch's arc lengths and left offsets (N,) [m], and the mask beside the seam."""
     along, across = plane.beside(line, torch)
     beside = (along >= 0.0) & (along <= arc_lengths(plane.flat(line))[-1])
     return along[beside], across[beside], beside

@@ -129,7 +129,7 @@ def result_of_camera(result: Result, camera: str | None) -> Result:
 def _work_of_camera(
     name: str, found: TransformResult, seen: Sequence[ObservationResult]
 ) -> WorkspaceResult:
-    """Return where a camera saw something, in the frame that carries it."""
+    """Return the places that a camera saw, in the frame that carries the camera."""
     pose = t.Transform.named(name, np.array(found.matrix))
     points = pose.apply(np.array([o.centre_in_camera for o in seen if o.centre_in_camera]))
     low, high = points.min(axis=0), points.max(axis=0)

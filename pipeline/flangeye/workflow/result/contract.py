@@ -26,7 +26,7 @@ class _Part(Described):
 
 
 class TransformResult(_Part):
-    """An estimated transform."""
+    """An estimated transform with its uncertainty."""
 
     matrix: Matrix
     """4x4, maps child coordinates to parent coordinates."""
@@ -131,7 +131,7 @@ class HoldoutResult(_Part):
 
 
 class VerificationResult(_Part):
-    """One verify step."""
+    """Result of one verify step."""
 
     passed: bool
     reason: str
@@ -231,7 +231,7 @@ class WeldTruthResult(_Part):
 
 
 class WeldResult(_Part):
-    """The torch's result."""
+    """Result of the weld."""
 
     mode: str
     completed: bool
@@ -330,7 +330,7 @@ class Provenance(_Part):
 
 
 class Result(_Part):
-    """The whole document."""
+    """The content of ``result.json``."""
 
     format: int = 1
     """Version of this contract."""

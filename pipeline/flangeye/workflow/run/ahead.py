@@ -31,7 +31,7 @@ class Done:
 
     @classmethod
     def of(cls, call: Callable[[], Any]) -> Done:
-        """Make a call."""
+        """Make a call and return it with its result or exception."""
         start = time.perf_counter()
         try:
             value, error = call(), None

@@ -33,7 +33,7 @@ class FolderError(FlangeyeError):
 
 
 class RunFolder:
-    """One run's files.
+    """The folder of one run and its files.
 
     Attributes:
         path: The folder.
@@ -73,7 +73,7 @@ class RunFolder:
 
     @property
     def log(self) -> Path:
-        """The MCAP log."""
+        """Path of the MCAP log."""
         return self.path / "run.mcap"
 
     def write(self, result: Result, recipe: Mapping[str, str]) -> None:

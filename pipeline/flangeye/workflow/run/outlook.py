@@ -53,7 +53,7 @@ class Outlook:
 
 
 def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
-    """Return how good the calibration from a log's captures is so far, by the log's recipe."""
+    """Return the quality of the calibration so far from a log's captures and recipe."""
     recipe = recipe_of_log(log, registry)
     return outlook(recipe, registry, log.observations(), log.source or t.Source(fingerprint=""))
 

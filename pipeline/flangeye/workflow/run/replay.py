@@ -31,7 +31,7 @@ class Repeat(Protocol):
     """How a ``replay`` part is called."""
 
     def __call__(self, log: Path, step: str) -> ReplayedStep:
-        """Return how the decisions of ``step``, made again from its log, compare."""
+        """Return the comparison of the decisions of ``step``, repeated from its log."""
 
 
 def replay_steps(log: Path, registry: Registry) -> Iterator[tuple[str, ReplayedStep]]:

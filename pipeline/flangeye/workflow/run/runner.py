@@ -257,7 +257,7 @@ class Runner:
                 yield capture
 
     def _meanwhile(self, capture: t.Capture | t.Rejection) -> dict[str, Done]:
-        """Return what segment and fit make of a capture, by label; runs in any thread."""
+        """Return the results of segment and fit for a capture, by label; runs in any thread."""
         if isinstance(capture, t.Rejection) or _unread_joint(capture) is not None:
             return {}
         found: dict[str, Done] = {}

@@ -235,7 +235,7 @@ def joint_speeds_of(robot: RobotModel) -> NDArray[np.float64]:
 
 
 class RobotMode(IntEnum):
-    """RTDE ``robot_mode``."""
+    """Values of RTDE's ``robot_mode``."""
 
     POWER_OFF = 3
     IDLE = 5
@@ -243,7 +243,7 @@ class RobotMode(IntEnum):
 
 
 class SafetyMode(IntEnum):
-    """RTDE ``safety_mode``."""
+    """Values of RTDE's ``safety_mode``."""
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
@@ -261,7 +261,7 @@ class SafetyMode(IntEnum):
 
 
 class Runtime(IntEnum):
-    """RTDE ``runtime_state``."""
+    """Values of RTDE's ``runtime_state``."""
 
     STOPPED = 1
     PLAYING = 2

@@ -195,7 +195,7 @@ class RtdePort:
 
 
 class RtdeSession(Connection):
-    """One client.
+    """Connection of one RTDE client.
 
     Attributes:
         inputs: Names of the variables that the client writes.

@@ -24,7 +24,7 @@ Answer = Callable[[URController], str]
 
 
 class DashboardSession(LineConnection):
-    """One client."""
+    """Connection of one client of the dashboard."""
 
     def __init__(self, network: Network, box: URController) -> None:
         super().__init__(network)

@@ -284,7 +284,7 @@ class Follower:
             self.phase = "done"
 
     def _blind(self, pose: ToolPose) -> str:
-        """Return why the measurements no longer allow going on; "" if they do."""
+        """Return the reason why measurements no longer allow welding; "" if they do."""
         settings, plan, sensing = self.task.settings, self.task.plan, self.sensing
         # Before the arc burns the arm may stand for longer.
         patience = settings.blind if self.arc_from is not None else 4.0 * settings.blind

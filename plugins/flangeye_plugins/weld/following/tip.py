@@ -146,11 +146,11 @@ class Pressing:
             self.side, self.wanted = -self.side, -self.wanted
 
     def since_lost(self, tip: float) -> float:
-        """Return how far the tip has moved since it lost contact with its wall [m]."""
+        """Return the tip's travel since it lost contact with its wall [m]."""
         return tip - self._lost
 
     def since_turned(self, tip: float) -> float:
-        """Return how far the tip has moved since it last changed sides [m]."""
+        """Return the tip's travel since it last changed sides [m]."""
         return tip - self._turned
 
 

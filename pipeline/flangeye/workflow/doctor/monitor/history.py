@@ -165,7 +165,7 @@ class History:
 
 
 def history_beside(log: Path) -> Path:
-    """Return where the history of the calibration in a log is kept, unless another is named."""
+    """Return the default path of a calibration's history, beside its log."""
     return log.with_name("monitor.jsonl")
 
 

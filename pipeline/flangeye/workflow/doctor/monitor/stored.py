@@ -78,7 +78,7 @@ class StoredCalibration:
 
     @cached_property
     def corners(self) -> Floats:
-        """(8, 3) corners of the work, relative to the point ``about`` of the covariance [m]."""
+        """Corners (8, 3) of the work, relative to the covariance's point ``about`` [m]."""
         source = self.log.source or t.Source("")
         box = workspace_of(source, None, self.calibration.pairs)
         if box is None:
@@ -131,7 +131,7 @@ class StoredCalibration:
         return bare, expected
 
     def _flange(self, seen: t.Observation) -> Floats:
-        """Return where the arm has its flange, or the circle that it sees there (4, 4)."""
+        """Return the pose (4, 4) of the flange, or of the circle seen there."""
         correction = self.calibration.as_reported().correction
         return corrected_flange(seen.base_T_flange.matrix, seen.joints, correction, self.arm)
 
@@ -153,7 +153,7 @@ class StoredCalibration:
         return mean_pose(np.array(found))
 
     def _jacobians(self, seen: Sequence[t.Observation], levers: Floats) -> Floats | None:
-        """Return (N, 6, n) of the targets' origins, where every joint angle is known."""
+        """Return Jacobians (N, 6, n) of the targets' origins, if every joint angle is known."""
         joints = [o.joints for o in seen if o.joints is not None]
         if self.arm is None or len(joints) < len(seen):
             return None
@@ -201,7 +201,7 @@ def _alike(one: Arm, other: Arm) -> bool:
 
 
 def _covariances(turn: Floats, features: Sequence[t.Feature], expected: Floats) -> Floats:
-    """Return (N, 5, 5) of centres and tilts in the base, the scans' own."""
+    """Return covariances (N, 5, 5) of the scans' centres and tilts, in the base."""
     out = np.zeros((len(features), 5, 5))
     for own, feature, frame in zip(out, features, expected, strict=True):
         own[:3, :3] = turn @ feature.centre_covariance @ turn.T

@@ -414,7 +414,7 @@ def _both(arm: PoseColumns, target: PoseColumns) -> tuple[Floats, Floats]:
 def _choice(
     arm: PoseColumns, target: PoseColumns, questions: Questions, robot: RobotModel | None
 ) -> Choice | None:
-    """Return how the numbers of both are written, as far as they show it."""
+    """Return the conventions of both tables, as far as their numbers show them."""
     numbers, seen = _both(arm, target)
     return writing_of(
         numbers, _writings(arm, numbers, questions, "", robot),

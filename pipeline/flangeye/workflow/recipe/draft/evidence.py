@@ -164,7 +164,7 @@ def _quaternion_at(numbers: Floats) -> int | None:
 
 
 def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseColumns:
-    """Return which three of six numbers are the position.
+    """Return the slice of the three numbers, of six, that are the position.
 
     These are the three that exceed any angle; if that is not unique, the first three.
     """

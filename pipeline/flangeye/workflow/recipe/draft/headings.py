@@ -128,7 +128,7 @@ class PoseColumns:
 
     @property
     def is_pose(self) -> bool:
-        """Whether it is a whole pose."""
+        """Whether the columns are a whole pose."""
         return self.rotations not in (("point",), JOINTS)
 
     @property

@@ -261,7 +261,7 @@ def _shows_print(records: Sequence[Recording], questions: Questions) -> bool:
 
 
 def mounting_seen(observations: Iterable[Observation]) -> tuple[str, str] | None:
-    """Return where the camera is that saw targets, and the evidence; None if undecided."""
+    """Return the mounting of the camera that saw targets, with evidence; None if undecided."""
     both = [(o.poses[FLANGE].matrix, o.feature.camera_T_target.matrix) for o in observations
             if FLANGE in o.poses and isinstance(o.feature, PoseFeature)]  # fmt: skip
     return _mounting(both) if both else None

@@ -307,7 +307,7 @@ def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:
 
 
 def _width(table: Table) -> int:
-    """Return how many numbers a row has that has no names; 0 with names."""
+    """Return the number of values in a row without column names; 0 with names."""
     return 0 if table.heading else len(table.rows[0][1])
 
 

@@ -140,19 +140,19 @@ class Budget:
 
     @property
     def freedom(self) -> Floats:
-        """(3,) effective degrees of freedom along x, y, z."""
+        """Effective degrees of freedom (3,) along x, y, z."""
         freedoms = np.array([c.freedom for c in self.contributions])
         rows = np.stack([c.sensitivity * c.standard for c in self.contributions], axis=1)
         return np.array([effective_freedom(row, freedoms) for row in rows])
 
     @property
     def coverage(self) -> Floats:
-        """(3,) coverage factors k for 95 % along x, y, z."""
+        """Coverage factors k (3,) for 95 % along x, y, z."""
         return np.array([coverage_factor(f, 0.95) for f in self.freedom])
 
     @property
     def expanded(self) -> Floats:
-        """(3,) expanded uncertainties along x, y, z [m]."""
+        """Expanded uncertainties (3,) along x, y, z [m]."""
         return np.asarray(self.coverage * self.standard)
 
     @property
@@ -294,7 +294,7 @@ def _of_calibration(budget: Budget) -> list[Contribution]:
 
 
 def _of_one_pose(result: Result) -> list[Contribution]:
-    """Return what one scan at one pose adds, from the errors on poses held out."""
+    """Return the contribution of one scan at one pose, from errors on held-out poses."""
     held, box = result.holdout, result.workspace
     if held is None or box is None:
         return []
