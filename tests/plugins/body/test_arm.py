@@ -121,8 +121,8 @@ RECIPE = (
     ("robot", "target", "message"),
     [
         ("ur10e", "robot", "body: robot needs the meshes of ur10e's links; name its URDF"),
-        (f"{{urdf: {URDF}}}", "{body: robot, at: unknown}", "leave out at: unknown"),
-        ("ur10e", "{body: robot, links: {9: a.stl}}", "ur10e has links 0 to 6, no [9]"),
+        (f"{{urdf: {URDF}}}", "{body: robot, at: unknown}", "remove at: unknown"),
+        ("ur10e", "{body: robot, links: {9: a.stl}}", "ur10e has links 0 to 6, not [9]"),
         ("ur10e", "{body: gripper, links: {0: a.stl}}", "target.links: is for body: robot only"),
     ],
 )

@@ -34,7 +34,7 @@ def test_without_a_simulated_cell_nothing_is_simulated() -> None:
     with pytest.raises(StageError) as error:
         scan_simulated(None, Seed(0), SimulatedScanParams())
     assert str(error.value) == (
-        "scan.simulated: looks with the scanner of a simulated cell, and the acquire step "
+        "scan.simulated: needs the scanner of a simulated cell, but the acquire step "
         "simulates none; use acquire.simulated, or scan.file"
     )
 
