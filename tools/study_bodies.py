@@ -194,7 +194,7 @@ def trial(name, seed, alone=True):
 
 
 def session(trials, rng):
-    """The one pose found in each of some scans, or None: where several are, the arm's motion tells."""
+    """Return the pose found in each scan, or None; the arm's motion decides between several."""
     arm = [
         rigid(rotation_exp(rng.normal(0, 3e-4, 3)), rng.normal(0, 2e-4, 3)) @ one.pose
         for one in trials

@@ -48,7 +48,7 @@ def answer(folder: Path, path: str) -> Response:
 
 
 def _found(folder: Path, path: str) -> Path | None:
-    """Return the file itself, whatever links lead to it, if it lies in one of the rooms."""
+    """Return a file with links resolved, if it lies in a folder that may be served."""
     with suppress(OSError, ValueError, RuntimeError):  # of names that no system has
         found = (folder / path).resolve()
         inside = any(

@@ -140,7 +140,7 @@ class TcpProfiler(Device):
                 self._newest = WeldProfile(self._scale * value, self._params.sigma, taken)
 
     def _value(self, line: bytes) -> float | None:
-        """Return the number of the column; None where there is none."""
+        """Return the value of the line's measurement column; None if it holds no number."""
         columns = line.decode("ascii", "replace").split(self._params.separator)
         try:
             value = float(columns[self._params.column - 1])

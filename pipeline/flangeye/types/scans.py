@@ -137,8 +137,8 @@ class WorkpieceScan:
     """A scan of the workpiece.
 
     Attributes:
-        cloud: In ``camera``; of several places the clouds one after the other, each in ``camera``
-            as it stood there.
+        cloud: Points in ``camera``. Clouds from several places are concatenated, each in the
+            ``camera`` of its own place.
         source: Description of the source.
         notes: Warnings and records.
         truth: Simulation only: the true seams by name, (N, 3) in ``base`` [m]. The runner keeps it

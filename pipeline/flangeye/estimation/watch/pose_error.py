@@ -48,7 +48,7 @@ class ArmPoseErrors:
     noise: tuple[float, float]
 
     def effects(self, poses: Floats) -> Floats:
-        """Return (N, 5, K): how weights move the centre and tilt the normal of (N, 4, 4)."""
+        """Return shifts and tilts (N, 5, K) of circles at poses (N, 4, 4) for unit weights."""
         place = poses[:, :3, 3] - self.middle[:3, 3]
         turn = rotation_log(poses[:, :3, :3] @ self.middle[:3, :3].T)
         of_pose = features(np.concatenate([place, turn], axis=1) / self.lengths, POWERS)
