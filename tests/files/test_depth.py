@@ -126,3 +126,46 @@ def test_a_folder_of_depth_images_is_calibrated(tmp_path: Path, command: Any) ->
     assert "clouds: 8 .png" in out
     code, out, err = command("run", recipe, "--out", tmp_path / "run")
     assert code == 0 and "VERIFIED" in out, out + err
+
+
+def test_a_tiff_of_three_floats_is_a_cloud_whatever_its_name(tmp_path: Path) -> None:
+    points = np.zeros((*SHAPE, 3), np.float32)
+    points[..., :2] = np.mgrid[: SHAPE[0], : SHAPE[1]].transpose(1, 2, 0)
+    points[..., 2] = np.where(slope() > 0, slope(), 0)
+    points[slope() == 0] = points[:20] = 0
+    path, photograph = tmp_path / "img_7.tiff", tmp_path / "img_8.tiff"
+    cv2.imwrite(str(path), np.ascontiguousarray(points[..., ::-1]))
+    cv2.imwrite(str(photograph), (points / 8).astype(np.uint8))
+    assert is_depth_image(path) and not is_depth_image(photograph)
+    told: list[str] = []
+    cloud = read_scan(path, "mm", told.append)
+    assert told == ["img_7.tiff: 7200 of 76800 points have (0, 0, 0): taken as missing"]
+    assert check_scan(path) == np.prod(SHAPE)
+    seen = points[..., 2] > 0
+    assert np.array_equal(np.isfinite(cloud.xyz[..., 2]), seen)
+    assert np.array_equal(cloud.xyz[seen], points[seen] / np.float32(1000))
+
+
+def test_of_several_cameras_that_of_the_images_size_is_taken(tmp_path: Path) -> None:
+    folder = tmp_path / "depth"
+    folder.mkdir()
+    cv2.imwrite(str(folder / "7.png"), slope())
+    camera_file(tmp_path)
+    other = {"fx": 620.0, "fy": 620.0, "cx": 640.0, "cy": 360.0}
+    (tmp_path / "depth_camera.json").write_text(json.dumps(other))
+    told: list[str] = []
+    read_scan(folder / "7.png", "mm", told.append)
+    assert told[0].startswith(f"camera of {tmp_path}/camera.json: focal length 310.0")
+
+
+@pytest.mark.parametrize(("name", "taken"), [("depth", "depth.json"), ("aligned_depth", "a.json")])
+def test_aligned_depths_are_the_colour_cameras(tmp_path: Path, name: str, taken: str) -> None:
+    folder = tmp_path / name
+    folder.mkdir()
+    cv2.imwrite(str(folder / "7.png"), slope())
+    for file, focal in (("a.json", 300.0), ("depth.json", 290.0)):
+        about = {"fx": focal, "fy": focal, "cx": 163.5, "cy": 118.0}
+        (tmp_path / file).write_text(json.dumps(about))
+    told: list[str] = []
+    read_scan(folder / "7.png", "mm", told.append)
+    assert told[0].startswith(f"camera of {tmp_path}/{taken}: ")

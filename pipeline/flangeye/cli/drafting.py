@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -131,6 +133,9 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
         return draft_recipe(survey, out, questions, registry)
     if "fit.rim" not in draft.text or _seen(draft, survey.folder, out, registry, 1) != []:
         return draft
+    if _seen(draft, survey.folder, out, registry, 1, ["steps.0.unit=cm"]):
+        questions.assumed.append("clouds in cm: read in m or mm, no scan shows the flange")
+        return replace(draft, text=draft.text.replace("archive: {", "archive: {unit: cm, ", 1))
     questions.given["target"] = None
     seen = "what is seen instead, 'body: gripper.stl' for a tool by its mesh"
     questions.ask("target", f"no scan shows the flange; {seen}", "flange")
@@ -138,7 +143,12 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
 
 
 def _seen(
-    draft: Draft, folder: Path, out: Path, registry: Registry, count: int
+    draft: Draft,
+    folder: Path,
+    out: Path,
+    registry: Registry,
+    count: int,
+    overrides: Sequence[str] = (),
 ) -> list[Observation] | None:
     """Return the first scans that show a drafted recipe's target; None if it does not run."""
     from flangeye.types import ArchivePath
@@ -147,7 +157,9 @@ def _seen(
 
     try:
         # Its paths start at the recipe's folder.
-        recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
+        recipe = parse_recipe(
+            draft.text, out.name, registry, [f"steps.0.path={folder}", *overrides]
+        )
         with at_work("looking for the target"):
             return Runner(recipe, registry, ArchivePath(folder)).take(count)
     except NothingSeen:

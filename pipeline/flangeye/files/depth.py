@@ -11,7 +11,13 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.cameras import CameraFile, cameras_in
-from flangeye.files.clouds import PER_METRE, LengthUnit, check_cloud_file, read_cloud
+from flangeye.files.clouds import (
+    PER_METRE,
+    LengthUnit,
+    check_cloud_file,
+    marked,
+    read_cloud,
+)
 from flangeye.files.clouds.plain import load_npy
 from flangeye.files.documents import document_of
 from flangeye.files.images import ImageError, decode_image, is_depth_image
@@ -32,7 +38,12 @@ def read_scan(
     """
     if not is_depth_image(path):
         return read_cloud(path, unit, told, from_viewpoint)
-    depths, camera = _depths(path)
+    depths = _pixels(path)
+    if depths.ndim == 3:  # x, y, z in every pixel; OpenCV turns the order of three round
+        xyz = np.array(depths.reshape(-1, 3)[:, ::-1], dtype=np.float32)
+        xyz = marked(path, xyz, told) / np.float32(PER_METRE[unit])
+        return PointCloud(CAMERA, xyz.reshape(depths.shape))
+    camera = _camera_of(path, depths.shape)
     if told:
         told(camera.note())
     z = np.where(depths > 0, depths * (_scale_of(camera.path) / PER_METRE[unit]), np.nan)
@@ -46,13 +57,18 @@ def check_scan(path: Path) -> int:
     Raises:
         StageError: As :func:`read_scan`.
     """
-    return math.prod(_depths(path)[0].shape) if is_depth_image(path) else check_cloud_file(path)
+    if not is_depth_image(path):
+        return check_cloud_file(path)
+    shape = _pixels(path).shape
+    if len(shape) == 2:
+        _camera_of(path, shape)
+    return math.prod(shape[:2])
 
 
-def _depths(path: Path) -> tuple[Floats, CameraFile]:
-    """Return depths (H, W) along z in the file's own unit, and the camera's calibration.
+def _pixels(path: Path) -> Floats:
+    """Return (H, W) depths along z, 0 or less where no surface was measured; or (H, W, 3) points.
 
-    Depths are 0 or less where no surface was measured.
+    Both are in the file's own unit.
     """
     import cv2
 
@@ -63,38 +79,50 @@ def _depths(path: Path) -> tuple[Floats, CameraFile]:
             pixels = decode_image(read_regular(path, MAX_FILE), cv2.IMREAD_UNCHANGED)
         except ImageError as error:
             raise StageError(f"{path}: {error}") from None
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint16, np.float32, np.float64):
+    floats = pixels.dtype in (np.float32, np.float64)
+    whole = pixels.dtype == np.uint16
+    if not (floats or whole) or pixels.shape[2:] not in [(), *([(3,)] if floats else [])]:
         raise StageError(
             f"{path}: is not a depth image: those have one channel, of 16 bits or of floats"
         )
+    return np.nan_to_num(pixels.astype(np.float64)) if pixels.ndim == 2 else pixels
+
+
+def _camera_of(path: Path, shape: tuple[int, ...]) -> CameraFile:
+    """Return the calibration beside a depth image of a shape."""
     # The folders' times of change are keys of the cache: the page runs on while a file is added
     changed = path.parent.stat().st_mtime_ns, path.parent.parent.stat().st_mtime_ns
-    camera = _camera_beside(path.parent, changed)
-    if camera is None:
+    cameras = _cameras_beside(path.parent, changed)
+    if not cameras:
         raise StageError(
             f"{path}: needs the calibration of its camera: put its file beside the depth images, "
             "for example camera.yaml with {fx: 910.2, fy: 909.8, cx: 640.1, cy: 361.0}"
         )
-    # The principal point of a depth camera is near the middle of its image
-    if np.abs(camera.matrix[:2, 2] / pixels.shape[::-1] - 0.5).max() > 0.25:
-        told = ", ".join(f"{value:.0f}" for value in camera.matrix[:2, 2])
+    middles = np.array([camera.matrix[:2, 2] for camera in cameras]) / shape[1::-1]
+    # The axis of a camera hits its image about the middle; depths turned to the colour camera have
+    # the size of its images
+    fitting = np.abs(middles - 0.5).max(axis=1) <= 0.25
+    if not fitting.any():
+        told = ", ".join(f"{value:.0f}" for value in cameras[0].matrix[:2, 2])
         raise StageError(
-            f"{path}: has {pixels.shape[1]} x {pixels.shape[0]} px, but {camera.path.name} has its "
-            f"principal point at {told}: it is for images of another size"
+            f"{path}: has {shape[1]} x {shape[0]} px, but {cameras[0].path.name} has "
+            f"its principal point at {told}: it is for images of another size"
         )
-    return np.nan_to_num(pixels.astype(np.float64)), camera
+    return cameras[int(fitting.argmax())]
 
 
 @lru_cache(maxsize=8)
-def _camera_beside(folder: Path, _changed: tuple[int, int]) -> CameraFile | None:
-    """Return the calibration in a folder or above it; the depth camera's, if there are several."""
+def _cameras_beside(folder: Path, _changed: tuple[int, int]) -> list[CameraFile]:
+    """Return the calibrations in a folder or above it, the likeliest first.
+
+    Depths are those of the depth camera, unless a name says that they are aligned: to the colour.
+    """
+    aligned = "align" in folder.name.lower()
     # A folder of depth images alone stands in that of the session
     for place in (folder, folder.parent) if "depth" in folder.name.lower() else (folder,):
-        found = cameras_in(place)
-        called = [camera for camera in found if "depth" in camera.path.name.lower()]
-        if found:
-            return (called or found)[0]
-    return None
+        if found := cameras_in(place):
+            return sorted(found, key=lambda c: ("depth" in c.path.name.lower()) == aligned)
+    return []
 
 
 @lru_cache(maxsize=8)

@@ -1,12 +1,14 @@
-"""Named values as plain data: JSON, YAML, TOML, OpenCV's storage, NumPy and MATLAB."""
+"""Named values as plain data: JSON, YAML, TOML, XML, Python's literals, NumPy and MATLAB."""
 
 from __future__ import annotations
 
+import ast
 import io
 import json
 import re
 import subprocess
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -100,7 +102,7 @@ def _yaml(file: Path) -> TableDocument:
 
 
 def _xml(file: Path) -> TableDocument:
-    """Return the content of an OpenCV XML file; entities are refused, since they can expand."""
+    """Return the content of an XML file; entities are refused, since they can expand."""
     text = read_text(file)
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         raise StageError(f"{file}: declares a document type or entities, which are not read")
@@ -110,17 +112,56 @@ def _xml(file: Path) -> TableDocument:
 
 
 def _element(element: ElementTree.Element) -> Any:
+    """Return the content of an element: its attributes and children by name, or its numbers."""
     children = list(element)
     if children and all(child.tag == "_" for child in children):
         return [_element(child) for child in children]
-    if children:
-        return {child.tag: _element(child) for child in children}
-    words = (element.text or "").replace('"', " ").split()
+    # What the storage says of its own types is no value
+    found = {k: _value(v, False) for k, v in element.attrib.items() if k not in ("type_id", "type")}
+    many = Counter(child.tag for child in children)
+    for child in children:
+        value = _element(child)
+        found[child.tag] = [*found.get(child.tag, []), value] if many[child.tag] > 1 else value
+    text = _value(element.text or "", element.tag == "data")
+    return found | ({"": text} if text != "" and found else {}) or text
+
+
+def _value(text: str, listed: bool) -> Any:
+    text = text.replace('"', " ").strip()
+    words = text.replace(",", " ").split()
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        return " ".join(words)
-    return numbers[0] if len(numbers) == 1 and element.tag != "data" else numbers
+        return text
+    return numbers if listed or len(numbers) > 1 else numbers[0] if numbers else ""
+
+
+def _python(file: Path) -> TableDocument:
+    """Return the lists of numbers that a script assigns or appends; nothing of it is run."""
+    data: dict[str, Any] = {}
+    for node in ast.walk(ast.parse(read_text(file, MAX_BYTES))):
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                data |= _literal(name, value)
+            case ast.Call(func=ast.Attribute(value=ast.Name(id=name), attr="append"), args=[value]):
+                rows = data.get(name)
+                if isinstance(rows, list):
+                    rows += _literal(name, value).values()
+    return TableDocument({k: v for k, v in data.items() if v}, lambda at: f"{file}: row {at + 1}")
+
+
+def _literal(name: str, node: ast.expr) -> dict[str, Any]:
+    """Return a list or mapping under its name, without calls such as np.array around it."""
+
+    class Bare(ast.NodeTransformer):
+        def visit_Call(self, node: ast.Call) -> Any:
+            return self.visit(node.args[0]) if node.args else node
+
+    try:
+        value = ast.literal_eval(Bare().visit(node))
+    except (ValueError, TypeError, SyntaxError):
+        return {}
+    return {name: value} if isinstance(value, list | dict) else {}
 
 
 def _numpy(file: Path) -> TableDocument:
@@ -164,7 +205,7 @@ def _matlab(file: Path) -> TableDocument:
 KINDS: Mapping[str, Callable[[Path], TableDocument | None]] = {
     ".json": _json, ".jsonl": _json_lines, ".ndjson": _json_lines,
     ".yaml": _yaml, ".yml": _yaml, ".samples": _yaml, ".xml": _xml,
-    ".toml": _toml, ".ini": _toml, ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,
+    ".py": _python, ".toml": _toml, ".ini": _toml, ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,
 }  # fmt: skip
 """Documents by their ending; everything else is text."""
 

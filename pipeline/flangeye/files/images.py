@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,8 +79,8 @@ def _is_cut_png(raw: bytes) -> bool:
 def is_depth_image(path: Path) -> bool:
     """Return whether a file is a depth image: by its name or its folder's, and its header.
 
-    A 16-bit image without such a name may be a camera's. An array of rows and columns is a depth
-    image whatever its name.
+    A 16-bit image without such a name may be a camera's. An array of rows and columns, and a TIFF
+    with three floats a pixel, are depth images whatever their name.
     """
     if path.suffix.lower() == ".npy" and path.is_file():
         try:
@@ -89,6 +89,8 @@ def is_depth_image(path: Path) -> bool:
             return False
         # A table of points or poses has fewer columns
         return len(shape) == 2 and min(shape) > 16
+    if path.suffix.lower() in (".tif", ".tiff") and path.is_file() and _holds_points(path):
+        return True
     folder = path.parent.name.lower()
     called = folder.startswith("depth") or folder.endswith("depth") or "depth" in path.stem.lower()
     ending = path.suffix.lower()
@@ -98,3 +100,23 @@ def is_depth_image(path: Path) -> bool:
         head = file.read(26)
     # Of a PNG's header the bit depth, 16, and the colour type, 0 for grey
     return ending != ".png" or head[24:] == bytes([16, 0])
+
+
+def _holds_points(path: Path) -> bool:
+    """Return whether a TIFF has three floats a pixel: x, y and z (TIFF 6.0, sections 2 and 19)."""
+    with open_regular(path) as file:
+        head = file.read(8)
+        order: Literal["little", "big"] = "big" if head[:2] == b"MM" else "little"
+        file.seek(int.from_bytes(head[4:], order))
+        entries = file.read(12 * int.from_bytes(file.read(2), order))
+        fields = {
+            int.from_bytes(entries[at : at + 2], order): entries[at + 4 : at + 12]
+            for at in range(0, len(entries), 12)
+        }
+        samples, formats = (fields.get(tag, bytes(8)) for tag in (277, 339))
+        written = formats[4:6]
+        if int.from_bytes(formats[:4], order) > 2:  # one for each sample, which stand elsewhere
+            file.seek(int.from_bytes(formats[4:], order))
+            written = file.read(2)
+    # Three samples, of which the first is a float
+    return [int.from_bytes(each, order) for each in (samples[4:6], written)] == [3, 3]

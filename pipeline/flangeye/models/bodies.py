@@ -230,8 +230,8 @@ def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[Len
         )
         other = f"it would be {in_each}" if fitting else "no unit makes it so"
         raise RecipeError(f"{path.name}: it is {has}, and {limits}; {other}")
-    # Inches are assumed only if neither metres nor millimetres fit.
-    used = min(fitting, key=lambda each: each == "in")
+    # Inches are assumed only if neither metres nor millimetres fit, centimetres last.
+    used = min(fitting, key=("m", "mm", "in", "cm").index)
     return used, (
         f"{path.name}: unit: {used} is assumed, by its size of {sizes[used] * 1e3:.0f} mm; state "
         "the unit where that is wrong"

@@ -79,7 +79,9 @@ no wall or window behind the robot is that far, and a wrong unit is off by 1,000
 DETECTED_LIMIT = 5.0
 """A unit is only detected where the median point is closer to the range than this."""
 
-NAMES: Mapping[LengthUnit, str] = {"m": "metres", "mm": "millimetres", "in": "inches"}
+NAMES: Mapping[LengthUnit, str] = {
+    "m": "metres", "mm": "millimetres", "cm": "centimetres", "in": "inches",
+}  # fmt: skip
 
 
 def median_distance(cloud: PointCloud) -> float:
@@ -128,7 +130,7 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerDa
 def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
     """Return the unit in which a median distance fits the scanner's range: metres or millimetres.
 
-    Inches lie between the two and are rare, so they have to be stated.
+    Centimetres and inches lie between the two and are rare, so they have to be stated.
 
     Args:
         path: The cloud's file.
@@ -142,8 +144,10 @@ def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
     outside = {unit: times_outside(raw / PER_METRE[unit], scanner) for unit in units}
     unit = min(units, key=lambda u: outside[u])
     if outside[unit] > DETECTED_LIMIT:
-        inches = times_outside(raw / PER_METRE["in"], scanner) <= DETECTED_LIMIT
-        cure = "unit: in, which fits," if inches else "unit: m or unit: mm,"
+        others: tuple[LengthUnit, ...] = ("cm", "in")
+        fitting = [u for u in others if times_outside(raw / PER_METRE[u], scanner) <= 1.0]
+        named = " or ".join(f"unit: {u}" for u in fitting or units)
+        cure = f"{named}, which fits," if fitting else f"{named},"
         raise StageError(
             f"{path}: median distance {raw:.3g} fits neither m nor mm: {_range(scanner)}; state "
             f"{cure} or the right scanner"

@@ -270,6 +270,10 @@ def _list_of(count: int) -> str:
     return r"\s*" + r"\s*,\s*".join([_N] * count) + r"\s*"
 
 
+def _spaced(count: int) -> str:
+    return r"\s+".join([_N] * count)
+
+
 def _named(names: str, number: str) -> str:
     """Return a pattern of numbers behind their names: ``X 1.5, Y 2``."""
     return r"\s*,\s*".join(name + number for name in names)
@@ -321,8 +325,13 @@ CONVENTIONS: Mapping[str, PoseConvention] = {
     "doosan": PoseConvention(
         "Doosan", ("X", "Y", "Z", "A", "B", "C"), "ZYZ", "mm", "deg", ("Doosan Robotics",)
     ),
-    # MVTec HALCON, create_pose with 'gba': Rx Ry Rz about turned axes, metres.
-    "halcon": PoseConvention("HALCON", ("X", "Y", "Z", "RX", "RY", "RZ"), "XYZ", "m", "deg"),
+    # MVTec HALCON, create_pose with 'gba': Rx Ry Rz about turned axes, metres. The program is what
+    # write_pose writes: representation 0, then the rotation, then the translation.
+    "halcon": PoseConvention(
+        "HALCON", ("X", "Y", "Z", "RX", "RY", "RZ"), "XYZ", "m", "deg",
+        program=rf"\nf 0\s(?=[^+]{{0,200}}?\nt {_spaced(3)})[^+]{{0,200}}?\nr {_spaced(3)}",
+        program_length="m",
+    ),
     # ROS REP 103, and the URDF: fixed axes.
     "rpy": PoseConvention("roll pitch yaw", ("X", "Y", "Z", "ROLL", "PITCH", "YAW"), "xyz", "m"),
     # The program is what ROS's tf_echo prints.

@@ -46,7 +46,7 @@ from flangeye_plugins.acquire.opening import (
     source_of,
 )
 
-StatedUnit = Literal["auto", "m", "mm", "in"]
+StatedUnit = Literal["auto", "m", "mm", "cm", "in"]
 
 
 class ArchiveParams(OpeningParams):

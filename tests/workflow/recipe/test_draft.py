@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from flangeye.cli import commands
 from flangeye.errors import RecipeError, StageError
+from flangeye.files.clouds import read_cloud, write_cloud
 from flangeye.models.boards import Board, print_of
 from flangeye.models.bodies import TargetBody
 from flangeye.plugin.registry import load_registry
@@ -138,6 +139,14 @@ def test_scans_without_a_flange_bring_up_the_mesh(folder: Path) -> None:
                 typed="flange\nbody: gripper\n")  # fmt: skip
     assert "no scan shows the flange" in said
     assert recipe(folder).context[TargetBody].name == "gripper"
+
+
+def test_clouds_in_centimetres_are_known_by_the_flange(folder: Path) -> None:
+    shutil.copy(SAMPLE / "poses.csv", folder)
+    for path in SAMPLE.glob("*.pcd"):
+        write_cloud(folder / path.name, read_cloud(path), "cm")
+    assert "assumed: clouds in cm: read in m or mm, no scan shows the flange" in init()
+    assert recipe(folder).steps[0].params.unit == "cm"
 
 
 def test_defaults_are_told_and_answers_are_not(folder: Path) -> None:

@@ -560,6 +560,102 @@ def names_of_visp(f, j, a, s):
         (f / f"{name}.txt").write_text(text(poses.reshape(-1, 16), " "))
 
 
+def xml_attributes(f, j, a, s):
+    def attributes(row):
+        return " ".join(f'{name}="{x:.9g}"' for name, x in zip(NAMES, row, strict=True))
+
+    (f / "session.xml").write_text("<session>" + "".join(
+        f'<sample id="{k}"><robot {attributes(arm)}/><marker {attributes(seen)}/></sample>\n'
+        for k, (arm, seen) in enumerate(zip(quaternion(a), quaternion(s), strict=True))
+    ) + "</session>")  # fmt: skip
+
+
+def markdown(f, j, a, s):
+    table = "| # | {} |\n|{}\n".format(" | ".join(NAMES), 8 * "---:|")
+    (f / "notes.md").write_text("# Monday\n" + "".join(
+        f"\n## {title}\n\n{table}"
+        + "".join(f"| {row.strip()} |\n" for row in text(indexed(quaternion(poses)), " | ").splitlines())
+        for title, poses in (("Robot (metres)", a), ("Marker in the camera", s))
+    ))  # fmt: skip
+
+
+def python_lists(f, j, a, s):
+    lines = [f"robot.append(np.array({arm.tolist()}))" for arm in a]
+    (f / "poses.py").write_text(
+        "import numpy as np\n\nrobot = []\n" + "\n".join(lines)
+        + f"\nmarker_poses = {vector(s).tolist()}\nprint(len(robot))\n"
+    )  # fmt: skip
+
+
+def lines_of_a_log(f, j, a, s):
+    (f / "node.log").write_text("".join(
+        f"[INFO] [16{k:02}.25] [calib]: {who} pose: [{text([row], ', ').strip()}]\n"
+        for k, rows in enumerate(zip(quaternion(a), quaternion(s), strict=True))
+        for who, row in zip(("robot", "marker"), rows, strict=True)
+    ))  # fmt: skip
+
+
+def labelled(f, j, a, s):
+    axes = ("x", "y", "z", "rx", "ry", "rz")
+    (f / "log.txt").write_text("".join(
+        f"[{k}] " + "; ".join(
+            f"{who}: " + " ".join(f"{n}={x:.9g}" for n, x in zip(axes, row, strict=True))
+            for who, row in zip(("robot", "marker"), rows, strict=True)
+        ) + "\n"
+        for k, rows in enumerate(zip(vector(a), vector(s), strict=True))
+    ))  # fmt: skip
+
+
+def halcon(f, j, a, s):
+    for name, poses in (("robot_pose", a), ("calib_obj_pose", s)):
+        for k, row in enumerate(euler(poses, "XYZ", 1.0)):
+            turn, place = text([row[3:] % 360], " "), text([row[:3]], " ")
+            (f / f"{name}_{k:02}.dat").write_text(
+                f"# 3D POSE PARAMETERS: rotation and translation\n\n# Used representation type:\nf 0\n"
+                f"\n# Rotation angles [deg] or Rodriguez vector:\nr {turn}\n"
+                f"# Translation vector (x y z [m]):\nt {place}\n"
+            )  # fmt: skip
+
+
+def colmap(f, j, a, s):
+    (f / "images.txt").write_text("# Image list with two lines of data per image\n" + "".join(
+        f"{k} {text([row[[6, 3, 4, 5]]], ' ').strip()} {text([3.7 * row[:3]], ' ').strip()} 1 {k}.jpg\n"
+        "10.5 20.5 -1 33.1 44.2 7\n" for k, row in enumerate(quaternion(s), 1)
+    ))  # fmt: skip
+    (f / "robot.csv").write_text("x,y,z,qx,qy,qz,qw\n" + text(quaternion(a)))
+
+
+def nerfstudio(f, j, a, s):
+    places = np.linalg.inv(s) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [{"file_path": f"images/{k:05}.png", "transform_matrix": pose.tolist()}
+              for k, pose in enumerate(places)]  # fmt: skip
+    camera = {"fl_x": 900, "fl_y": 900, "cx": 640, "cy": 480}
+    (f / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    np.save(f / "robot.npy", a)
+
+
+def metashape(f, j, a, s):
+    (f / "cameras.xml").write_text("<document><chunk><cameras>" + "".join(
+        f'<camera id="{k}" sensor_id="0" label="{k}"><transform>{text([pose.ravel()], " ")}</transform>'
+        "</camera>" for k, pose in enumerate(np.linalg.inv(s))
+    ) + "</cameras></chunk></document>")  # fmt: skip
+    np.save(f / "robot.npy", a)
+
+
+def apart_by_name(f, j, a, s):
+    (f / "rec.json").write_text(json.dumps({
+        f"{who}_{what}": quaternion(poses)[:, at].tolist() for who, poses in (("robot", a), ("marker", s))
+        for what, at in (("positions", slice(3)), ("quaternions", slice(3, 7)))
+    }))  # fmt: skip
+
+
+def times_before_six(f, j, a, s):
+    times = 1690000000 + 2.5 * np.arange(COUNT)[:, None]
+    for name, poses in (("tcp", a), ("board", s)):
+        rows = np.hstack([times, vector(poses)])
+        (f / f"{name}.txt").write_text("\n".join(" ".join(map(str, row)) for row in rows))
+
+
 LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
@@ -636,6 +732,17 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "Epson's X, Y, Z, U, V, W": epson,
     "`ros2 topic echo --csv`, a stamp and a frame before the pose": topic_as_csv,
     "`fMe.txt` and `cMo.txt`, as ViSP names poses": names_of_visp,
+    "XML of elements with attributes, `<robot x=… y=…/>`": xml_attributes,
+    "tables of Markdown, each under a title": markdown,
+    "a Python file, `robot.append(np.array(…))`, `marker_poses = […]`": python_lists,
+    "lines of a log, `[INFO] [1690.25] [calib]: robot pose: […]`": lines_of_a_log,
+    "lines `robot: x=… y=…; marker: x=… y=…`": labelled,
+    "HALCON's pose files, `r …` and `t …`": halcon,
+    "COLMAP's `images.txt`, in no unit of length": colmap,
+    "nerfstudio's `transforms.json`, with the camera's axes of OpenGL": nerfstudio,
+    "Metashape's `cameras.xml`": metashape,
+    "JSON of `robot_positions`, `robot_quaternions`, …": apart_by_name,
+    "a time before position and rotation vector, without a heading": times_before_six,
 }
 """What is in the folder, and how it is written."""
 

@@ -60,8 +60,8 @@ def _beyond(value: float, others: Points, times: float) -> bool:
     return bool(others.size) and value > times * float(others.max())
 
 
-LengthUnit = Literal["m", "mm", "in"]
-PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "in": 1 / 0.0254}
+LengthUnit = Literal["m", "mm", "cm", "in"]
+PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "cm": 100, "in": 1 / 0.0254}
 """Number of each unit in a metre."""
 
 CLOUD_FILES: Mapping[str, Callable[[Path], PointTable]] = {
@@ -123,18 +123,24 @@ def read_cloud(
     with at_hand(path):
         table = _open(path)
         xyz = table.decode()
-    xyz = xyz if xyz.flags.writeable else xyz.copy()
-    missing = mark_missing(xyz)
+    xyz = marked(path, xyz, told)
     viewpoint: Viewpoint | None = table.viewpoint
     if viewpoint is not None and from_viewpoint:
         xyz = viewpoint.seen_from(xyz)
-    for note in (missing, viewpoint.note(from_viewpoint) if viewpoint else ""):
-        if note and told:
-            told(f"{path.name}: {note}")
+    if viewpoint is not None and told:
+        told(f"{path.name}: {viewpoint.note(from_viewpoint)}")
     per_metre = STATED.get(getattr(table, "unit", "")) or PER_METRE[unit]
     if per_metre != 1:
         xyz /= np.float32(per_metre)  # exact to the last bit, which times 0.001 is not
     return PointCloud(CAMERA, xyz.reshape(*table.shape, 3))
+
+
+def marked(path: Path, xyz: Points, told: Callable[[str], None] | None) -> Points:
+    """Return the points of a file, NaN where they are missing, and tell how many are."""
+    xyz = xyz if xyz.flags.writeable else xyz.copy()
+    if (missing := mark_missing(xyz)) and told:
+        told(f"{path.name}: {missing}")
+    return xyz
 
 
 def check_cloud_file(path: Path) -> int:

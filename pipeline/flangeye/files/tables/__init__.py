@@ -20,11 +20,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.documents import KINDS, document_of, stacked
+from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import read_any_text
 from flangeye.files.scans import natural, partners
 from flangeye.files.tables.table import (
@@ -37,6 +39,7 @@ from flangeye.files.tables.table import (
     number_of,
     record_of,
     rows_of,
+    table_of,
 )
 from flangeye.files.words import reason_of
 from flangeye.types.pose_formats import CONVENTIONS
@@ -155,10 +158,14 @@ def _row_names(table: Table, column: Column | None) -> Sequence[str]:
     if table.names or column is None:
         return table.names
     known = column in table.heading or (isinstance(column, int) and column <= len(table.rows[0][1]))
-    cells = table.texts(table.index(column)) if known else []
-    if any(number_of(cell) is not None for cell in cells) and not all(map(str.isdecimal, cells)):
-        return ()
-    return [PurePath(cell).stem for cell in cells] if len(set(cells)) == len(table.rows) else ()
+    # Another table may call the column of its files otherwise
+    columns = [table.index(column)] if known else range(len(table.heading))
+    for cells in map(table.texts, columns):
+        called = all(cell.isdecimal() or number_of(cell) is None for cell in cells)
+        files = known or all(PurePath(cell).suffix for cell in cells)
+        if called and files and len(set(cells)) == len(table.rows):
+            return [PurePath(cell).stem for cell in cells]
+    return ()
 
 
 def sources(file: Path) -> list[Rows]:
@@ -171,8 +178,21 @@ def sources(file: Path) -> list[Rows]:
     if document is not None:
         return rows_of(file, document)
     text = read_any_text(file)
-    program = program_rows(file, text)
-    return [program] if program else text_rows(file, text)
+    found = program_rows(file, text) or labelled_rows(file, text) or _of_images(file, text)
+    return [found] if found else text_rows(file, text)
+
+
+def _of_images(file: Path, text: str) -> Rows | None:
+    """Return the poses of COLMAP's list of images, ``images.txt``; None for another file."""
+    names = [f"camera_T_world_{axis}" for axis in ("qw", "qx", "qy", "qz", "x", "y", "z")]
+    lines = [(n, line.split()) for n, line in enumerate(text.splitlines(), 1)]
+    rows = [
+        (f"{file}:{n}", tuple(words[1:8] + words[9:]))
+        for n, words in lines
+        # Between them stand the points that each image shows: x, y and a number
+        if len(words) == 10 and words[0].isdecimal() and number_of(words[9]) is None
+    ]
+    return Rows((*names, "name"), rows) if rows and file.name == "images.txt" else None
 
 
 def _of_files(folder: Path, name: str, files: Sequence[Path]) -> Table:
@@ -185,7 +205,8 @@ def _of_files(folder: Path, name: str, files: Sequence[Path]) -> Table:
     apart = len({file.parent for file in files}) == len(files)
     names = [file.parent.name if apart else file.stem for file in files]
     named = names if len(joined) == len(files) else []
-    rows = Rows(tables[0].heading if tables else (), joined, "", named)
+    first = tables[0] if tables else Rows((), [])
+    rows = first._replace(rows=joined, part="", names=named)
     return _table(name, folder / name, rows, files)
 
 
@@ -194,7 +215,10 @@ def _single(file: Path) -> Rows:
     if document is not None:
         return record_of(file, document)
     text = read_any_text(file)
-    return program_rows(file, text) or row_of(file, text) or Rows((), [])
+    return (
+        program_rows(file, text) or labelled_rows(file, text, 1) or row_of(file, text)
+        or Rows((), [])
+    )  # fmt: skip
 
 
 def _table(name: str, file: Path, rows: Rows, files: Sequence[Path] = ()) -> Table:
@@ -265,6 +289,43 @@ def _counted(table: Table) -> tuple[str, ...]:
     return tuple(f"{stem}.{i}" for i in range(len(table.rows[0][1]) if table.rows else 0))
 
 
+_NUMBER = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?(?![\w.:])"
+_LABELLED = (
+    r"([A-Za-z_][\w ./-]{0,60}?)[ \d]{0,9}[:=][\s\[({]{0,9}"
+    rf"((?:{_NUMBER}(?:[ \t,;|\[\](){{}}]+{_NUMBER}"
+    rf"|[\s,;\[\](){{}}]+{_NUMBER}(?!\]?[ \t]*[A-Za-z]))*)?)"
+)
+"""A label, and the numbers behind it: over several lines, until another label."""
+
+
+def labelled_rows(file: Path, text: str, fewest: int = MIN_CAPTURES) -> Rows | None:
+    """Return numbers behind labels, a row for each time the labels come again; None if few are.
+
+    ``robot: x=0.1 y=0.2 …`` and ``[INFO] [17.2]: marker pose: [0.3, …]`` are such; a label with
+    numbers behind its colon is a list, one with other labels behind it begins their names.
+    """
+    records: list[dict[str, Any]] = [{}]
+    before, counted = "", 0
+    for label, numbers in re.findall(_LABELLED, text):
+        found = [n for word in re.findall(_NUMBER, numbers) if (n := number_of(word)) is not None]
+        if not found:
+            before = label
+            continue
+        counted += len(found)
+        name = f"{before} {label}".strip() if len(found) == 1 else label
+        if name in records[-1]:
+            records.append({})
+        records[-1][name] = found if len(found) > 1 else found[0]
+    usual = Counter(tuple(record) for record in records).most_common(1)[0][0]
+    alike = [record for record in records if tuple(record) == usual]
+    few = len(alike) < fewest or sum(np.size(value) for value in alike[0].values()) < 6
+    if few or counted < 0.7 * len(re.findall(_NUMBER, text)):
+        return None
+    where = [f"{file}: {i}" for i in range(1, len(alike) + 1)]
+    bare = [next(iter(r.values())) if len(usual) == 1 else r for r in alike]
+    return table_of(list(zip(where, bare, strict=True)))
+
+
 @dataclass
 class TextBlock:
     """Rows without a blank line, a comment or a title between them.
@@ -273,6 +334,7 @@ class TextBlock:
         rows: Location and cells of each row.
         heading: Names of its columns.
         title: The last line of words above it.
+        above: The line of words above that.
         after_blank: Whether a blank line or a title stands above it, not a comment alone.
         marked: Whether a mark, not blanks, stands between the cells.
     """
@@ -280,6 +342,7 @@ class TextBlock:
     rows: list[Row] = field(default_factory=list)
     heading: tuple[str, ...] = ()
     title: str = ""
+    above: str = ""
     after_blank: bool = False
     marked: bool = False
 
@@ -325,7 +388,7 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
         comment = bool(_COMMENT.match(line))
         # What stands behind the numbers of a line is a remark
         words = re.split(r"\s(?:#|//)", line)[0] if re.match(r"[-+.\d]", line) else line
-        plain = _COMMENT.sub("", words)
+        plain = _COMMENT.sub("", words, count=1) if comment else words
         cells = split(plain) if plain else ()
         counts = split.wide and len(cells) < 3  # rows, or what stands below: robot 7
         numbers = any(number_of(cell) is not None or _list_in(cell) for cell in cells)
@@ -341,7 +404,8 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
             units = {word.strip("[]()") for word in cells}
             if units <= known and len(cells) == len(block.heading):  # units under names
                 cells = tuple(map("{} {}".format, block.heading, cells))
-            block.heading, block.title = cells, plain.rstrip(" :")
+            block.heading, block.above = cells, block.title
+            block.title = re.split(r"[,(]", plain)[0].rstrip(" :")
     if block.rows:
         yield block
 
@@ -392,7 +456,7 @@ def _with_matrices(block: TextBlock) -> TextBlock:
     if not (len(block.heading) in widths or (block.marked and len(block.heading) > 2)):
         block.heading = ()
     else:
-        block.title = ""
+        block.title = block.above
     if not block.heading and len(widths) == 1:
         stack = stacked(np.array([[_or_nan(cell) for cell in cells] for _, cells in block.rows]))
         lines = stack.shape[1] if stack is not None else 1
@@ -458,7 +522,7 @@ class _splitter:  # noqa: N801  a function with a memory
     def __call__(self, line: str) -> tuple[str, ...]:
         # Python prints arrays as array([[…]], dtype=float32): drop all but the numbers
         line = re.sub(r"^\s*[\w.]+\((?=[-\s\[(.\d])|,\s*dtype=\w+(?=\)+\s*$)", "", line).strip()
-        line = line.strip("| ") if self.mark == "|" else line
+        line = line.removeprefix("|").removesuffix("|").strip() if self.mark == "|" else line
         line = line.rstrip(", ") if line.startswith(("[", "(")) else line  # a list in a list
         if self.mark == " ":
             return tuple(line.strip("[](){}").replace(", ", " ").split())

@@ -160,7 +160,7 @@ _ENDING = re.compile(r"\.[A-Za-z]\w{1,4}$")
 
 def record_of(file: Path, document: TableDocument) -> Rows:
     """Return a document that is one record as a single row."""
-    return _table([(str(file), document.data)])
+    return table_of([(str(file), document.data)])
 
 
 def rows_of(file: Path, document: TableDocument) -> list[Rows]:
@@ -176,7 +176,7 @@ def rows_of(file: Path, document: TableDocument) -> list[Rows]:
         one = data.shape in MATRICES or data.ndim == 1
         return [_columns(document.where, {"": data[None] if one else data})]
     if isinstance(data, list):
-        return [_table([(document.where(at), record) for at, record in enumerate(data)])]
+        return [table_of([(document.where(at), record) for at, record in enumerate(data)])]
     if isinstance(data, Mapping):
         found = _numbered(file, data) or _side_by_side(document.where, data) or _named(file, data)
         if found:
@@ -202,7 +202,7 @@ def _numbered(file: Path, data: Mapping[str, Any]) -> list[Rows]:
         keys = [groups[stems[0]][n] for n in numbers]
         if len(stems) == 1 and _ENDING.search(stems[0]):
             named = [{SCAN: key} | record for key, record in zip(keys, named, strict=True)]
-        table = _table([(f"{file}: {k}", r) for k, r in zip(keys, named, strict=True)])
+        table = table_of([(f"{file}: {k}", r) for k, r in zip(keys, named, strict=True)])
         found.append(table._replace(part=",".join(stems), names=keys))
     return sorted(found, key=lambda rows: -len(rows.heading))
 
@@ -240,7 +240,7 @@ def _side_by_side(where: Callable[[int], str], data: Mapping[str, Any]) -> list[
     lists = dict(_lists("", data))
     records = [value for value in lists.values() if _are_records(value)]
     if len(records) == 1:
-        return [_table([(where(at), record) for at, record in enumerate(records[0])])]
+        return [table_of([(where(at), record) for at, record in enumerate(records[0])])]
     stacks = Counter(
         len(value)
         for value in lists.values()
@@ -279,7 +279,7 @@ def _columns(where: Callable[[int], str], lists: Mapping[str, Any]) -> Rows:
                 for i, index in enumerate(np.ndindex(*shape[1:])):
                     columns[".".join(filter(None, (name, *map(str, index))))] = flat[:, i].tolist()
         else:
-            records = _table([(where(i), {name: each}) for i, each in enumerate(value)])
+            records = table_of([(where(i), {name: each}) for i, each in enumerate(value)])
             for i, column in enumerate(records.heading):
                 columns[column] = [cells[i] for _, cells in records.rows]
     count = max(map(len, columns.values()), default=0)
@@ -292,10 +292,10 @@ def _named(file: Path, data: Mapping[str, Any]) -> list[Rows]:
     if not data or not all(isinstance(v, list | Mapping | np.ndarray) for v in data.values()):
         return []
     named = [(f"{file}: {key}", {SCAN: key, "": value}) for key, value in data.items()]
-    return [_table(named)._replace(names=list(data))]
+    return [table_of(named)._replace(names=list(data))]
 
 
-def _table(records: Sequence[tuple[str, Any]]) -> Rows:
+def table_of(records: Sequence[tuple[str, Any]]) -> Rows:
     """Return the columns of all records, in the order of their first one, and a row each."""
     cells = [(where, _cells(where, record)) for where, record in records]
     columns = list(dict.fromkeys(name for _, found in cells for name in found))

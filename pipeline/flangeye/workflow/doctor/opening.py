@@ -427,7 +427,7 @@ def found_in(
     if len(seen.features) < FEWEST_SAMPLES and first.params is not None and stated is not None:
         # Other units; last the z of clouds that were written with the scene behind the scanner
         tried: list[dict[str, Any]] = [
-            {"unit": unit} for unit in ("auto", "m", "mm", "in") if unit != stated
+            {"unit": unit} for unit in ("auto", "m", "mm", "cm", "in") if unit != stated
         ]
         for change in [*tried, {"stretch": (1.0, 1.0, -1.0)}]:
             params = first.params.model_copy(update=change)

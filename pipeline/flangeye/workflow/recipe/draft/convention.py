@@ -12,7 +12,7 @@ from flangeye.errors import RecipeError
 from flangeye.files.recording import MAX_REACH
 from flangeye.files.tables import Column, Table, read_table, rows_together
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.pose_corrections import inverted
+from flangeye.maths.pose_corrections import inverted, scaled
 from flangeye.models.robots import RobotModel
 from flangeye.types import Floats
 from flangeye.types.pose_formats import (
@@ -32,6 +32,7 @@ from flangeye.workflow.recipe.draft.evidence import (
     Writing,
     mounting_of,
     poses_by_number,
+    size_of,
     writing_of,
 )
 from flangeye.workflow.recipe.draft.headings import (
@@ -381,18 +382,43 @@ def _seen_together(
     poses, marks = choice.arm.poses(numbers), choice.target.poses(seen)
     if poses is None or marks is None:
         return arm, target
-    asked = questions.given
-    way = asked.get("pose") or WAYS[""][bool(arm.frames and is_inverse(arm.frames))]
+    if target.axes_of_motion:
+        marks = _measured(poses, marks, target, questions)
+    _store_mounting((arm, poses), (target, marks), questions)
+    return arm, target
+
+
+def _store_mounting(
+    arm: tuple[PoseColumns, Floats], target: tuple[PoseColumns, Floats], questions: Questions
+) -> None:
+    """Store where the camera is, and which way round the target's poses are, if they show it."""
+    asked, frames, seen = questions.given, arm[0].frames, target[0].frames
+    way = asked.get("pose") or WAYS[""][bool(frames and is_inverse(frames))]
     camera, upright = asked.get("camera"), asked.get("target-pose")
-    ways = WAYS["target-"][:: -1 if target.frames and is_inverse(target.frames) else 1]
+    ways = WAYS["target-"][:: -1 if seen and is_inverse(seen) else 1]
     mounting = mounting_of(
-        poses if way == "base_T_flange" else inverted(poses), marks,
+        arm[1] if way == "base_T_flange" else inverted(arm[1]), target[1],
         [camera] if camera else ["base", "flange"], [upright] if upright else ways,
     )  # fmt: skip
     if mounting is not None:
         questions.likely["camera"] = (mounting.camera, mounting.told)
         questions.likely["target-pose"] = (mounting.target, mounting.told)
-    return arm, target
+
+
+def _measured(poses: Floats, marks: Floats, target: PoseColumns, questions: Questions) -> Floats:
+    """Return poses from images alone in metres, and store what corrects them."""
+    inverse = bool(target.frames and is_inverse(target.frames))
+    size = size_of(poses, inverted(marks) if inverse else marks)
+    if size is None:
+        return marks
+    questions.mended = {"scale": float(f"{size:.6g}")}
+    if target.axes_of_motion != "optical":
+        questions.mended["axes"] = target.axes_of_motion
+    questions.assumed.append(
+        f"{target.table.name}: poses from images alone have no unit of length; theirs is "
+        f"{size:.4g} m by the arm's motion, with a camera in its hand (its scale changes it)"
+    )
+    return scaled(marks, np.full(3, size))
 
 
 def _orders(pose: PoseColumns, questions: Questions, prefix: str) -> list[PoseColumns]:

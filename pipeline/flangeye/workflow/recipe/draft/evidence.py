@@ -48,7 +48,7 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
         rest = replace(rest, index=columns[0] + 1)
         columns, numbers = columns[1:], numbers[:, 1:]
         told = f"column {columns[0]} is a running index"
-    elif _rises(numbers[:, 0]) and _shape(numbers[:, 1:]) and not _shape(numbers):
+    elif _rises(numbers[:, 0]) and _shape(numbers[:, 1:]) and not _of_whole_row(numbers):
         rest = replace(rest, time=columns[0] + 1)
         columns, numbers = columns[1:], numbers[:, 1:]
     found = []
@@ -74,6 +74,12 @@ def _is_index(numbers: Floats) -> bool:
     six = numbers.shape[1] == 7 and _quaternion_at(numbers) is None
     broken = bool((others != np.round(others)).any())
     return counts or (_rises(first) and six) or (not _rises(first) and broken)
+
+
+def _of_whole_row(numbers: Floats) -> bool:
+    """Return whether a row has no number before its poses; 7 are a quaternion's, or angles."""
+    seven = numbers.shape[1] == 7 and _quaternion_at(numbers) is None
+    return _shape(numbers) and not (seven and np.abs(numbers).max() > 360.0)
 
 
 def _rises(column: Floats) -> bool:
@@ -340,6 +346,21 @@ def mounting_of(
     twin = next(((c, t) for c in cameras for t in targets if c != camera and t != way), None)
     same = f"; so does {twin[0]} with {twin[1]}, the same equation" if twin else ""
     return Mounting(camera, way, f"fits to {1e3 * best:.1f} mm{beyond}{same}")
+
+
+def size_of(arm: Floats, seen: Floats) -> float | None:
+    """Return the length [m] of the unit of a target's places, seen by a camera in the hand.
+
+    ``(R_A - 1) t_X - s R_X t_B = -t_A`` is linear in t_X and s; None if it determines no length.
+    """
+    try:
+        motions = motions_of(arm, seen)
+        turned = motions.b[:, :3, 3] @ park_martin(motions)[:3, :3].T
+    except (CalibrationRefused, ValueError, np.linalg.LinAlgError):
+        return None
+    left = np.concatenate([motions.a[:, :3, :3] - np.eye(3), -turned[..., None]], axis=2)
+    found, *_ = np.linalg.lstsq(left.reshape(-1, 4), -motions.a[:, :3, 3].ravel())
+    return float(found[3]) if found[3] > 0 else None
 
 
 def _residuals_by_twins(

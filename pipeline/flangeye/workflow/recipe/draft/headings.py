@@ -21,10 +21,8 @@ _PLACES = (
     "position",
     "pos",
     "translation",
-    "translations",
     "trans",
     "tvec",
-    "tvecs",
     "location",
     "origin",
     "t",
@@ -33,12 +31,11 @@ _PLACES = (
 )
 _TURNS: Mapping[str, str] = {
     "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
-    "rotation": "r", "rotations": "r", "rot": "r", "r": "r", "euler": "r", "angles": "r",
-    "angle": "r", "winkel": "r", "theta": "r",
-    "rvec": "v", "rvecs": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
+    "rotation": "r", "rot": "r", "r": "r", "euler": "r", "angle": "r", "winkel": "r", "theta": "r",
+    "rvec": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
 """Names of rotations, and what the names of their columns begin with."""
-_OPENCV = ("rvec", "rvecs", "tvec", "tvecs")
+_OPENCV = ("rvec", "tvec")
 """What OpenCV calls the pose of what a camera sees."""
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
 """Lengths of lists that are whole poses, and what their numbers are unless a name decides."""
@@ -143,7 +140,9 @@ class PoseColumns:
         """``arm`` or ``target``, from the names of columns, program or file; None if unknown."""
         if self.table.convention is not None and not self._is_echo:
             return "arm"
-        opencv = "target" if self.called.lower() in _OPENCV else None
+        if self.axes_of_motion:
+            return "target"
+        opencv = "target" if self.called.lower().removesuffix("s") in _OPENCV else None
         of_columns = role_in(self.called)
         names = [self.table.name.rpartition(":")[2], *re.split(r"[/:]", self.table.name)[::-1]]
         of_file = next((role for name in names if (role := role_in(name))), None)
@@ -152,12 +151,28 @@ class PoseColumns:
     @property
     def frames(self) -> tuple[str, str] | None:
         """Frames A and B of A_T_B, from a name; None if no name has them."""
+        if self.axes_of_motion and self.called.startswith("transform"):
+            return "target", "camera"
         names = (self.called, *re.split(r"[/:]", self.table.name)[::-1])
         found = next((found for name in names if (found := frames_in(name))), None)
         if self.parent_first and found:
             return found[::-1]
         # ROS's tf_echo prints the pose of the frame that is named last, base_to_tool0 or base2tool0
         return found[::-1] if found and self._is_echo and _TO.search(self.table.name) else found
+
+    @property
+    def axes_of_motion(self) -> str | None:
+        """Axes of the camera's frame, where its poses are from images alone; else None.
+
+        COLMAP, Metashape and nerfstudio write such files; they have no unit of length.
+        """
+        for beside, called, axes in (
+            ("name", "camera_T_world", "optical"), ("sensor_id", "transform", "optical"),
+            ("file_path", "transform_matrix", "opengl"),
+        ):  # fmt: skip
+            if called == self.called and beside in self.table.heading:
+                return axes
+        return None
 
     @property
     def _is_echo(self) -> bool:
@@ -372,9 +387,10 @@ def _is_axis(word: str) -> bool:
 
 def _without(words: list[str], parts: Sequence[str]) -> tuple[str, list[str]]:
     """Return the part of a pose named by the last or first word, and the other words."""
-    for at in (len(words) - 1, 0):
-        if words and words[at].lower() in parts:
-            return words[at].lower(), words[:at] + words[at + 1 :]
+    for at in (len(words) - 1, 0) if words else ():
+        word = words[at].lower()
+        if part := next((each for each in (word, word.removesuffix("s")) if each in parts), ""):
+            return part, words[:at] + words[at + 1 :]
     return "", words
 
 

@@ -125,7 +125,9 @@ def _reader(
     if survey.tables:
         scans = bool(survey.clouds or survey.images)
         try:
-            return {"table": table_params(survey.tables, questions, _model(robot), scans)}
+            read = {"table": table_params(survey.tables, questions, _model(robot), scans)}
+            mended = {"corrected": {"reader": read, "target": questions.mended}}
+            return mended if questions.mended else read
         except RecipeError as error:
             # Scans in a form that is not read are what is missing beside poses
             many = len(survey.tables[0].rows)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 from flangeye.files.cameras import cameras_in
@@ -44,12 +45,14 @@ class Questions:
         prompt: Asks the user; None without a terminal.
         assumed: Lines on the defaults used, to print at the end.
         likely: Likely answers from the data with their evidence, by option.
+        mended: What corrects the target's poses, as ``reader.corrected`` takes it.
     """
 
     given: dict[str, str | None] = field(default_factory=dict)
     prompt: Prompt | None = None
     assumed: list[str] = field(default_factory=list)
     likely: dict[str, tuple[str, str]] = field(default_factory=dict)
+    mended: dict[str, Any] = field(default_factory=dict)
 
     def ask(
         self,
@@ -183,8 +186,8 @@ def look(folder: Path) -> FolderSurvey:
         table
         for place, of in places(folder, others)
         for table in _tables(folder, place, len(of))
-        # What calibrated the camera saw the target: OpenCV's rvecs and tvecs
-        if not cameras & set(of) or any("vec" in name.lower() for name in table.heading)
+        # What calibrated the camera saw the target, or where it was: rvecs, transform_matrix
+        if not cameras & set(of) or re.search("vec|transform", " ".join(table.heading).lower())
     ]
     return FolderSurvey(folder, files, _whole(folder, tables), points, cameras)
 
@@ -212,7 +215,8 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
     """Yield files as named in a recipe; files with similar names share one pattern."""
     groups: dict[str, list[Path]] = defaultdict(list)
     known = (
-        ".csv", ".txt", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script", *KINDS,
+        ".csv", ".txt", ".md", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script",
+        *KINDS,
     )  # fmt: skip
     for file in files:
         # A file that is larger [bytes] holds scans, and is not looked into
