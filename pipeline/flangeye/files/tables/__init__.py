@@ -289,25 +289,20 @@ def _counted(table: Table) -> tuple[str, ...]:
     return tuple(f"{stem}.{i}" for i in range(len(table.rows[0][1]) if table.rows else 0))
 
 
-_NUMBER = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?(?![\w.:])"
-_LABELLED = (
-    r"([A-Za-z_][\w ./-]{0,60}?)[ \d]{0,9}[:=][\s\[({]{0,9}"
-    rf"((?:{_NUMBER}(?:[ \t,;|\[\](){{}}]+{_NUMBER}"
-    rf"|[\s,;\[\](){{}}]+{_NUMBER}(?!\]?[ \t]*[A-Za-z]))*)?)"
-)
-"""A label, and the numbers behind it: over several lines, until another label."""
-
-
 def labelled_rows(file: Path, text: str, fewest: int = MIN_CAPTURES) -> Rows | None:
     """Return numbers behind labels, a row for each time the labels come again; None if few are.
 
     ``robot: x=0.1 y=0.2 …`` and ``[INFO] [17.2]: marker pose: [0.3, …]`` are such; a label with
     numbers behind its colon is a list, one with other labels behind it begins their names.
     """
+    one = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?(?![\w.:])"
+    # Over several lines, until another label
+    several = rf"{one}(?:[ \t,;|\[\](){{}}]+{one}|[\s,;\[\](){{}}]+{one}(?!\]?[ \t]*[A-Za-z]))*"
+    pattern = rf"([A-Za-z_][\w ./-]{{0,60}}?)[ \d]{{0,9}}[:=][\s\[({{]{{0,9}}((?:{several})?)"
     records: list[dict[str, Any]] = [{}]
     before, counted = "", 0
-    for label, numbers in re.findall(_LABELLED, text):
-        found = [n for word in re.findall(_NUMBER, numbers) if (n := number_of(word)) is not None]
+    for label, numbers in re.findall(pattern, text):
+        found = [n for word in re.findall(one, numbers) if (n := number_of(word)) is not None]
         if not found:
             before = label
             continue
@@ -319,7 +314,7 @@ def labelled_rows(file: Path, text: str, fewest: int = MIN_CAPTURES) -> Rows | N
     usual = Counter(tuple(record) for record in records).most_common(1)[0][0]
     alike = [record for record in records if tuple(record) == usual]
     few = len(alike) < fewest or sum(np.size(value) for value in alike[0].values()) < 6
-    if few or counted < 0.7 * len(re.findall(_NUMBER, text)):
+    if few or counted < 0.7 * len(re.findall(one, text)):
         return None
     where = [f"{file}: {i}" for i in range(1, len(alike) + 1)]
     bare = [next(iter(r.values())) if len(usual) == 1 else r for r in alike]

@@ -98,18 +98,9 @@ def _parts(numbers: Floats) -> list[tuple[int, int]]:
     if width == 3 or (width in (6, 7, 12, 16) and not (width == 12 and not _is_matrix(numbers))):
         return [(0, width)]
     for first, second in (
-        (16, 16),
-        (12, 12),
-        (7, 7),
-        (6, 6),
-        (6, 16),
-        (7, 16),
-        (6, 7),
-        (7, 6),
-        (16, 3),
-        (7, 3),
+        (16, 16), (12, 12), (7, 7), (6, 6), (6, 16), (7, 16), (6, 7), (7, 6), (16, 3), (7, 3),
         (6, 3),
-    ):
+    ):  # fmt: skip
         if first + second == width:
             return [(0, first), (first, second)]
     return []

@@ -18,17 +18,8 @@ from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
 JOINTS = ("joints",)
 """In place of a rotation: joint angles."""
 _PLACES = (
-    "position",
-    "pos",
-    "translation",
-    "trans",
-    "tvec",
-    "location",
-    "origin",
-    "t",
-    "p",
-    "xyz",
-)
+    "position", "pos", "translation", "trans", "tvec", "location", "origin", "t", "p", "xyz",
+)  # fmt: skip
 _TURNS: Mapping[str, str] = {
     "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
     "rotation": "r", "rot": "r", "r": "r", "euler": "r", "angle": "r", "winkel": "r", "theta": "r",
@@ -320,26 +311,14 @@ def _of_list(listed: str, axis: str) -> list[str]:
 def _words(name: str) -> list[str]:
     """Return the words of a column's name; R of ``R_gripper2base`` is one."""
     words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.replace("°", "deg")) if w]
-    for pair, one in {
-        ("rotation", "vec"): "rotvec",
-        ("rotation", "vector"): "rotvec",
-        ("rot", "vec"): "rotvec",
-        ("translation", "vec"): "tvec",
-        ("translation", "vector"): "tvec",
-        ("trans", "vec"): "tvec",
-        ("rpy", "angles"): "rpy",
-        ("euler", "angles"): "euler",
-        ("euler", "xyz"): "euler",
-        ("axis", "angle"): "rotvec",
-        ("rot", "quat"): "quat",
-        ("rotation", "quaternion"): "quat",
-        ("rotation", "matrix"): "rotation",
-        ("rot", "mat"): "rotation",
-    }.items():
-        for i in range(len(words) - 1):
-            if tuple(w.lower() for w in words[i : i + 2]) == pair:
-                words[i : i + 2] = [one]
-    return words
+    joined = " ".join(words)
+    for two, one in (
+        (r"rot(?:ation)? vec(?:tor)?|axis angle", "rotvec"), (r"rot(?:ation)? quat\w*", "quat"),
+        (r"trans(?:lation)? vec(?:tor)?", "tvec"), (r"rot(?:ation)? mat(?:rix)?", "rotation"),
+        (r"rpy angles", "rpy"), (r"euler (?:angles|xyz)", "euler"),
+    ):  # fmt: skip
+        joined = re.sub(rf"\b(?:{two})\b", one, joined, flags=re.IGNORECASE)
+    return joined.split()
 
 
 def _time(words: Sequence[str]) -> tuple[bool, str | None]:
