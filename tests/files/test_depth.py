@@ -89,7 +89,9 @@ def test_a_calibration_that_is_missing_or_of_another_size_is_named(tmp_path: Pat
     other.mkdir()
     cv2.imwrite(str(other / "depth_1.png"), slope()[::2, ::2])
     camera_file(other)
-    with pytest.raises(StageError, match="has 160 x 120 px, but camera.json its principal point"):
+    with pytest.raises(
+        StageError, match="has 160 x 120 px, but camera.json has its principal point"
+    ):
         read_scan(other / "depth_1.png")
 
 
