@@ -122,7 +122,7 @@ def test_a_csv_that_says_no_poses_is_refused(tmp_path: Path, text: Any, message:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("unit: cm\nposes: []\n", ":1: unit: Input should be 'm', 'mm' or 'in'"),
+        ("unit: ft\nposes: []\n", ":1: unit: Input should be 'm', 'mm', 'cm' or 'in'"),
         ("unit: mm\n", ":1: poses: Field required"),
         ("unit: mm\nposes:\n  - {cloud: a.pcd, position: [1, 2], quaternion_xyzw: [0, 0, 0, 1]}\n",
          ":3: poses.0.position.2: Field required"),
