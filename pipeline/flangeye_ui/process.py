@@ -54,7 +54,9 @@ class RunProcess:
         self.path = folder / (words[1] if self.checks else stamped)
         self._before = set(self.path.glob(f"{CHECKS}/*"))
         self.moves, self.stopped = move, ""
-        self.view, self.log = RunView(self.path.name), RunLog(self.path / "run.mcap")
+        # A check has a log of its own, below a folder that the command names.
+        self.log = RunLog(self.path / (f"{CHECKS}/run.mcap" if self.checks else "run.mcap"))
+        self.view = RunView(self.path.name)
         self.outlook: Outlook | None = None
         self.cloud: Floats = np.zeros((0, 3))
         self.flange: Floats = np.zeros((0, 3))

@@ -10,12 +10,13 @@ from nicegui import Client, ui
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.regular import read_text
+from flangeye.files.yaml_lines import parse_yaml
 from flangeye.workflow.doctor.monitor.chart import COLOURS, sentence
 from flangeye.workflow.doctor.monitor.history import History, history_beside
 from flangeye.workflow.doctor.monitor.stored import stored_calibration
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.recipe.load import Recipe
-from flangeye.workflow.run.folder import recipe_of_log
+from flangeye.workflow.run.folder import CHECKS, recipe_of_log
 from flangeye_ui.archive_page import link
 from flangeye_ui.charts import residual_chart
 from flangeye_ui.layout import ActionBar, command_line, mistake, page
@@ -91,7 +92,8 @@ class Watch:
     def _words(self) -> list[str]:
         stored = ["monitor", f"runs/{self._which.value}"]
         if self._now:
-            return [*stored, "--live", "--scans", f"{self._count.value or 1:.0f}"]
+            scans = ["--live", "--scans", f"{self._count.value or 1:.0f}"]
+            return [*stored, *scans, *other_seed(self._project.folder / stored[1])]
         return [*stored, "--archive", self._new.value or "NEW"]
 
     @property
@@ -208,6 +210,16 @@ def live_recipe(project: Project, run: Path) -> Recipe | None:
         return None
     recipe = recipe_of_log(read_run(run / "run.mcap"), project.registry)
     return recipe if is_live(recipe) else None
+
+
+def other_seed(run: Path) -> list[str]:
+    """Return the words by which an emulated scanner takes other scans than those of a run."""
+    path = run / "recipe.resolved.yaml"
+    match parse_yaml(read_text(path), str(path)).data:
+        case {"scanner": {"driver": {"emulator": {"seed": int(seed)}}}}:
+            checks = len(list(run.glob(f"{CHECKS}/*")))
+            return ["--set", f"scanner.driver.emulator.seed={seed + 1 + checks}"]
+    return []
 
 
 def _charts(project: Project) -> None:

@@ -194,11 +194,13 @@ def test_the_whole_way_on_an_arm_on_loopback(browser: Any, tmp_path: Path, size:
             walk.press("Check: the arm moves")
             page.get_by_text("The arm will move.").wait_for()
             assert cell.standing()
-            assert served.last(r"^code \d{6} moves the arm: (flangeye monitor runs/.* --live )")
+            assert served.last(
+                r"^code \d{6} moves the arm: (flangeye monitor runs/.* --live .*seed=2 )"
+            )
             move(page, served)
             cell.wait_until(cell.moving, patience=60)
             page.locator(".bar .halt").wait_for()
-            page.get_by_text("OK: the calibration still holds").wait_for(timeout=WAIT)
+            page.get_by_text("OK: the calibration still holds").wait_for(timeout=60_000)
             assert page.locator(".shot img").count() == 3
             assert cell.standing()
             walk.see("Watch")
