@@ -23,7 +23,7 @@ from flangeye_plugins.weld.following.welding import Welding
 from flangeye_plugins.weld.settings import INSIDE
 
 WAITING = 0.2
-"""Minimum speed fraction, so that a wall that has ended is noticed."""
+"""Share of its speed at which the tip seeks a lost wall."""
 
 
 class Follower:
