@@ -159,6 +159,8 @@ def _from_known_places(equations: Equations) -> VariantUnknowns:
     here, there = np.broadcast_arrays(equations.centres, there)
     seen = np.isfinite(here[..., :1])
     mean_here, mean_there = _mean(here, seen), _mean(there, seen)
+    # Centroids first: the translation drops out, and the best rotation is that of the cross
+    # covariance.
     cross = _outer(there - mean_there[:, None], here - mean_here[:, None])
     # A normal turns the camera as much as two centres that are this far apart [m]: they decide
     # where the centres lie on a line, and do no harm elsewhere where they are all wrong
@@ -176,6 +178,8 @@ def _from_poses(equations: Equations) -> VariantUnknowns:
     seen = np.broadcast_to(np.nan_to_num(equations.rotations), (k, n, 3, 3))
     # Row by row, vec(mount_R_target) = (turns' kron seen') vec(carrier_R_camera) at every sample.
     total = np.einsum("knia,knjb->kabij", turns, seen).reshape(k, 9, 9)
+    # The first singular vectors are the two rotations up to a common sign and scale; the
+    # determinant, which must be positive, gives the sign.
     u, _, vt = np.linalg.svd(total)
     turn, rotation = u[:, :, 0].reshape(k, 3, 3), vt[:, 0].reshape(k, 3, 3)
     sign = np.sign(np.linalg.det(rotation))[:, None, None]
@@ -202,6 +206,8 @@ def _from_centres(equations: Equations) -> VariantUnknowns:
     k, n = right.shape[:2]
     of_rotation = np.einsum("ij,knl->knijl", np.eye(3), np.broadcast_to(centres, (k, n, 3)))
     of_rotation = of_rotation.reshape(k, n, 3, 9) * np.isfinite(right)[..., None]
+    # The nine entries of the rotation are free here; orthogonality is restored afterwards, and the
+    # positions are then solved again with the proper rotation.
     found = _least_squares(np.concatenate([rows, of_rotation], axis=-1), right)
     rotation = nearest_rotation(found[:, 6:].reshape(-1, 3, 3))
     position, place = _positions(equations, rotation)
@@ -253,6 +259,7 @@ def rotations_of_poses(equations: Equations) -> Rotations:
         y = nearest_rotation(_contracted(by_y, x, z))
         moved = _contracted(by_z, x, y)
         z = nearest_rotation(moved)
+    # The objective is the trace that the last step maximised: the start that ends highest wins.
     best = np.argmax((moved * z).sum(axis=(-1, -2)), axis=0), np.arange(k)
     return x[best], y[best], z[best]
 
@@ -264,6 +271,7 @@ def _by_unknown(left: Floats, seen: Floats, right: Floats) -> list[Floats]:
     depend on their number. Each matrix (K, 9, 81) has the entries of one unknown in its rows and
     the products of the other two in its columns.
     """
+    # 729 sums over the samples hold all that the alternation needs of them.
     form = np.einsum("knac,knde,knbf->kabcdef", left, right, seen).reshape(-1, 9, 9, 9)
     return [np.moveaxis(form, axis, 1).reshape(-1, 9, 81) for axis in (1, 2, 3)]
 
@@ -311,6 +319,7 @@ def _rows_of_centres(equations: Equations) -> tuple[Floats, Floats]:
     places = np.nan_to_num(equations.places)
     carried = (mounts[..., :3, :3] @ places[..., None])[..., 0] + mounts[..., :3, 3]
     rows = _outer_rows(equations.centres, bases, carried)
+    # Columns: R_X (9), t_X (3), R_Y (9), t_Y (3)
     rows[..., 9:12], rows[..., 21:] = np.eye(3), -bases[..., :3, :3]
     return _where_seen(equations.centres, rows, bases[..., :3, 3])
 

@@ -86,6 +86,8 @@ def fit(equations: Equations) -> VariantFits:
     scales = [_first_scale(block) for block in blocks]
     fit_steps = 15
     for _ in range(fit_steps):
+        # E step: each sample's expected precision given its residual. M step: one Gauss-Newton step
+        # of the unknowns, then the scales.
         weights = [_weights(b, s) for b, s in zip(blocks, scales, strict=True)]
         information, gradient = _normal_equations(blocks, weights, scales)
         unknowns = _moved(unknowns, _solved(information, gradient))
@@ -117,6 +119,7 @@ def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[ErrorBlock]
 
 
 def _centre_block(equations: Equations, unknowns: VariantUnknowns, mounts: Floats) -> ErrorBlock:
+    # r = R c + t - M p. A small left rotation phi adds phi x (R c) = -hat(R c) phi.
     turned = equations.centres @ unknowns.rotation.swapaxes(-1, -2)
     expected = (mounts[..., :3, :3] @ unknowns.place[..., None])[..., 0] + mounts[..., :3, 3]
     residuals = turned + unknowns.position[:, None] - expected
@@ -138,6 +141,7 @@ def _rotation_block(equations: Equations, unknowns: VariantUnknowns, mounts: Flo
     turns = mounts[..., :3, :3]
     expected = turns @ unknowns.turn[:, None]
     seen = unknowns.rotation[:, None] @ equations.rotations
+    # Taken on the left, in the carrier, so that the camera's rotation enters with derivative one.
     residuals = log_of(seen @ expected.swapaxes(-1, -2))
     eye = np.broadcast_to(np.eye(3), (*residuals.shape, 3))
     zero = np.zeros_like(eye)
@@ -158,6 +162,7 @@ def _normal_block(equations: Equations, unknowns: VariantUnknowns, mounts: Float
         turns = equations.bases[..., :3, :3]
         lever = turns.swapaxes(-1, -2) @ expected[..., None]
         parts += [turns @ hat(lever[..., 0]), zero]
+    # The difference of two unit vectors has two coordinates only: none along the normal.
     return _block(residuals, parts, 2, FINEST_ANGLE)
 
 
@@ -178,6 +183,7 @@ def _first_scale(block: ErrorBlock) -> Floats:
 def _weights(block: ErrorBlock, scale: Floats) -> Floats:
     """Return the weights (K, N) of the samples; 0 if not measured."""
     distances = block.squares / scale[:, None] ** 2
+    # Mean of the hidden precision of a t distribution: (nu + d) / (nu + r^2 / s^2)
     weights = np.asarray((TAILS + block.dimension) / (TAILS + distances))
     weights[np.isnan(weights)] = 0.0
     return weights
@@ -186,6 +192,8 @@ def _weights(block: ErrorBlock, scale: Floats) -> Floats:
 def _scale(block: ErrorBlock, weights: Floats) -> Floats:
     seen = np.isfinite(block.squares)
     total = (weights * np.where(seen, block.squares, 0.0)).sum(axis=-1)
+    # By the number of coordinates and not by the sum of the weights: that is the maximum of a t
+    # distribution's likelihood.
     count = block.dimension * seen.sum(axis=-1)
     return np.asarray(np.sqrt(np.maximum(total / count, block.finest**2)))
 
@@ -209,6 +217,8 @@ def _normal_equations(
 
 def _solved(information: Floats, gradient: Floats) -> Floats:
     diagonal = np.einsum("kii->ki", information)
+    # Scaled to unit diagonal, because radians and metres differ by orders of magnitude and the
+    # damping has to be fair to both.
     size = np.sqrt(np.maximum(diagonal, 1e-300))
     p = information.shape[-1]
     # Share of the information that is added to every direction, for those nothing is known of
@@ -246,12 +256,15 @@ def _score(
 ) -> VariantFits:
     likelihood = count = np.zeros(1)
     for block, scale in zip(blocks, scales, strict=True):
+        # Log-density of a multivariate t: -d log s - (nu + d) / 2 log(1 + r^2 / (nu s^2)), without
+        # the constants that all variants share.
         squares, d = block.squares, block.dimension
         seen = np.isfinite(squares).sum(axis=-1)
         tails = np.nansum(np.log1p(squares / (TAILS * scale[:, None] ** 2)), axis=-1)
         likelihood = likelihood - d * seen * np.log(scale) - 0.5 * (TAILS + d) * tails
         count = count + d * seen
     return VariantFits(
+        # A variant whose start failed has NaN residuals: it must lose, not poison the maximum.
         np.nan_to_num(likelihood, nan=-np.inf),
         tuple(block.residuals for block in blocks),
         np.stack(scales, axis=-1),
@@ -277,6 +290,7 @@ def log_of(rotations: Floats) -> Floats:
     )
     length = np.linalg.norm(twice_sine_axis, axis=-1, keepdims=True)
     trace = np.trace(rotations, axis1=-2, axis2=-1)[..., None]
+    # 2 sin and 2 cos of the angle: accurate at all angles, where arccos of the trace is not.
     angle = np.arctan2(length, trace - 1.0)
     away = np.broadcast_to([1.0, 0.0, 0.0], twice_sine_axis.shape)
     direction = np.where(length > 1e-9, twice_sine_axis / np.maximum(length, 1e-9), away)
@@ -410,8 +424,13 @@ def exceedance(ratio: float, count: float, further: int, freedom: float, effect:
 
     if ratio <= 0 or freedom < 1 or effect <= 1:
         return 1.0
+    # For normal errors the likelihood ratio is a function of F: ratio = n / 2 log(1 + F m /
+    # freedom). The minimum keeps the exponential finite.
     f = np.expm1(min(2 * ratio / count, 500.0)) * freedom / further
+    # If the effect were just negligible, F would be smaller by effect^2: that is the centre of the
+    # distribution under the null hypothesis.
     noncentral = f * further / effect**2
+    # Patnaik: a non-central F is a central one, scaled, with more degrees of freedom
     shrunk = f / (1 + noncentral / further)
     equivalent = (further + noncentral) ** 2 / (further + 2 * noncentral)
     return float(fdtrc(equivalent, freedom, shrunk))
@@ -426,6 +445,7 @@ def negligible(kinds: int) -> Floats:
 
 def _effect(before: Misfit, after: Misfit) -> float:
     """Return the largest reduction of any kind of error, in units of the negligible size."""
+    # Independent errors add in squares, so this is the error that the correction took away.
     shrunk = np.sqrt(np.clip(before.numbers**2 - after.numbers**2, 0.0, None))
     return float((shrunk / negligible(len(shrunk))).max())
 
@@ -467,6 +487,7 @@ def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
     """
     seen = np.isfinite(equations.centres[0, :, 0]) & ~ignored
     folds_of = 4  # every fourth sample is held out in turn
+    # Dealt in turn among the seen samples, so that each fold covers the whole session.
     dealt = np.where(seen, np.cumsum(seen) % folds_of, -1)
     folds = dealt[None] == np.arange(folds_of)[:, None]
     found = fit(equations.without(folds | ignored))
@@ -492,6 +513,7 @@ def _spread(session: RecordedSession) -> float:
 
 def covariance_of(information: Floats) -> Floats:
     """Return the inverse of an information matrix; unobservable directions get a huge variance."""
+    # Unit diagonal first: 1e-13 then means the same for radians and metres.
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(size, size) + 1e-13 * np.eye(len(size))
     return np.asarray(np.linalg.inv(scaled) / np.outer(size, size))

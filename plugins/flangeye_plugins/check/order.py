@@ -43,7 +43,7 @@ Later = Callable[[float], tuple[Floats, Mask]]
 
 
 class Reordered(NamedTuple):
-    """Poses of other moments: the session with them, and the samples that have one."""
+    """A session with the poses of other moments, and the samples that have such a pose."""
 
     session: RecordedSession
     known: Mask
@@ -52,10 +52,13 @@ class Reordered(NamedTuple):
 
 @part("check.order")
 def order(session: RecordedSession) -> Findings:
-    """Scans are paired with the pose before or after their own, or in the opposite order."""
+    """Find scans paired with the pose before or after their own, or in the opposite order."""
     session.require_samples()
     every = np.arange(1, len(session) - 1)
+    # A shift by a few samples is what a lost or doubled row does; a later start is tried for shifts
+    # by one only, since each start costs a fit.
     tried = [(arms, by, 0) for arms in session.arms for by in (1, -1, 2, -2, 3, -3)]
+    # All starts count as tried (Bonferroni), although the search fits a few of them only.
     count = len(tried) + 2 * len(every) + 1
     for by in (1, -1):
         near = narrowed(every, lambda some, by=by: _gains(session, by, some))  # type: ignore[misc]
@@ -111,7 +114,7 @@ def _backwards(session: RecordedSession) -> Reordered:
 def _at_other_times(
     session: RecordedSession, change: Change, arms: Arms, **correction: Any
 ) -> Reordered:
-    """Return the session with what the controllers said at other times, the links with it."""
+    """Return the session with the poses (and links' poses) of other moments."""
     moved, known = change(session.poses)
 
     def alike(poses: Floats) -> Floats:
@@ -137,6 +140,7 @@ def clock(session: RecordedSession) -> Findings:
     if found is None:
         return
     arms, middle = session.arms[found.which // len(coarse)], coarse[found.which % len(coarse)]
+    # A second grid within one step of the first: the likelihood is smooth in the delay.
     near = middle + np.linspace(-1, 1, 17) * step * 3 / delays
     others = _delays(session, near, [arms])
     finer = _evidence(session, others, further=1)
@@ -181,7 +185,7 @@ def _evidence(
     further: int = 0,
     tried: int | None = None,
 ) -> Significance | None:
-    """Hold poses of other moments against those given, on the samples that have both."""
+    """Compare the poses of other moments with the recorded ones, on samples that have both."""
     fits = _fits(session, others)
     if fits is None:
         return None
@@ -192,7 +196,7 @@ def _evidence(
 def _fits(
     session: RecordedSession, others: Sequence[Reordered]
 ) -> tuple[VariantFits, VariantFits, Indices] | None:
-    """Return fits as given, of the others, and which of the former has the samples of each."""
+    """Return fits of the recorded poses, of the alternatives, and each alternative's match."""
     known = np.array([other.known for other in others])
     # Samples with a target that an alternative must leave
     fewest_left = 5
@@ -213,7 +217,7 @@ SAME = 1e-9
 
 @part("check.identity")
 def identity(session: RecordedSession) -> Findings:
-    """A driver without data returned the identity as a robot pose or a marker's pose."""
+    """Find identity matrices, which a driver without data returns as the pose of arm or marker."""
     for whose, poses in _reported(session):
         robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < SAME
         if robot.any():
@@ -229,7 +233,7 @@ def identity(session: RecordedSession) -> Findings:
 
 
 def _reported(session: RecordedSession) -> Iterator[tuple[str, Floats]]:
-    """Yield the poses (N, 4, 4) that the controllers reported, and what to call them."""
+    """Yield each reported pose's name, such as second robot, and the poses (N, 4, 4)."""
     if session.uses_poses:
         yield "robot", session.poses
     if session.links is not None:
@@ -265,6 +269,7 @@ def _repeats(
     # A target that has moved further was seen from another pose [m]
     moved = np.linalg.norm(others[after] - others[before], axis=1) > 1e-3
     wrong = np.zeros(len(numbers), dtype=bool)
+    # Of two equal rows the later one is stale: the driver had nothing newer to return.
     wrong[after[moved]] = True
     made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
     if wrong.any() and not made_up:
@@ -289,7 +294,7 @@ def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, wha
 
 @part("check.moved")
 def moved(session: RecordedSession) -> Findings:
-    """The camera or the target was moved part way through."""
+    """Find a camera or a target that was moved during the session."""
     session.require_samples()
     null = fit_of(session)
     seen = np.flatnonzero(session.seen)
@@ -305,6 +310,7 @@ def moved(session: RecordedSession) -> Findings:
         after = np.arange(len(session)) >= some[:, None]
         return _together(fit(equations.without(after)), fit(equations.without(~after)))
 
+    # Two separate calibrations cost a full set of parameters more, which the test accounts for.
     near = narrowed(starts, lambda some: two(some).likelihood)
     evidence = best_of(null, two(near), null.parameters, tried=len(starts))
     start = int(near[evidence.which])
@@ -343,7 +349,7 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
 
 @part("check.tool")
 def tool(session: RecordedSession) -> Findings:
-    """The poses are those of a tool (TCP): a constant offset and turn in the flange frame."""
+    """Find poses of a tool (TCP) instead of the flange: a constant offset and turn."""
     _require_known_place(session)
     turn, read = _turned(session)
     known, free = fit(equations_of(read)), fit(equations_of(read).with_free_place())
@@ -390,7 +396,7 @@ def tool(session: RecordedSession) -> Findings:
 
 
 def _turned(session: RecordedSession) -> tuple[float, RecordedSession]:
-    """Return the angle of all normals to the target's axis [rad], and the session turned by it.
+    """Return the normals' common angle to the target's axis [rad], and the session corrected.
 
     Returns:
         0 and the session as it is, where the normals do not all stand alike.
@@ -417,7 +423,7 @@ def _turned(session: RecordedSession) -> tuple[float, RecordedSession]:
 
 
 def _require_known_place(session: RecordedSession) -> None:
-    """Go on only where it is known where the arm has the target.
+    """Refuse a session in which the target's pose on the arm is unknown.
 
     Raises:
         NotApplicable: It is not, or no arm has it.
@@ -430,9 +436,9 @@ def _require_known_place(session: RecordedSession) -> None:
 
 
 def _known(found: VariantFits, offset: Floats) -> bool:
-    """Whether the offset is known to a tenth of itself along every direction.
+    """Whether the offset's standard deviation is below a tenth of its length in every direction.
 
-    Where it is not, the smooth errors of an arm pass for one: the poses turn too little.
+    If it is larger, the poses turn too little, and smooth errors of the arm look like an offset.
     """
     covariance = np.linalg.pinv(found.information[0], hermitian=True)[6:9, 6:9]
     deviation = np.sqrt(np.linalg.eigvalsh(covariance)[-1])

@@ -1,4 +1,4 @@
-"""Single samples that are wrong, targets seen turned over, and motion that is missing."""
+"""Checks for single wrong samples, targets detected with a flipped rotation, and missing motion."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FLIPS: dict[str, Floats] = {
 
 @part("check.outlier")
 def outlier(session: RecordedSession) -> Findings:
-    """One sample disagrees with all the others."""
+    """Find a sample that disagrees with all the others."""
     session.require_samples()
     null = fit_of(session)
     distances = ((null.lengths[0] / null.scales[0]) ** 2).sum(axis=-1)
@@ -52,7 +52,7 @@ def outlier(session: RecordedSession) -> Findings:
 
 
 def _without(session: RecordedSession, null: VariantFits, index: int) -> Significance:
-    """Hold "this sample has an error of its own" against the session as it is."""
+    """Test the hypothesis that one sample has an error of its own against the unchanged session."""
     freed = fit(equations_of(session).without(np.arange(len(session))[None] == index))
     dimensions = _dimensions(null)
     # An error of its own takes up all that the sample says; what is left of it is the scales.
@@ -68,7 +68,7 @@ def _without(session: RecordedSession, null: VariantFits, index: int) -> Signifi
 
 
 def _dimensions(null: VariantFits) -> Floats:
-    """Return the number of coordinates (B,) of each kind of error, from their total."""
+    """Return the number of coordinates (B,) of each kind of error in one sample."""
     rest = int(null.count[0] / np.isfinite(null.lengths[0, :, 0]).sum()) - 3
     return np.array([3.0, rest]) if len(null.residuals) > 1 else np.array([3.0])
 
@@ -105,7 +105,7 @@ def flips(session: RecordedSession) -> Findings:
 
 @part("check.scatter")
 def scatter(session: RecordedSession) -> Findings:
-    """Markers' rotations scatter although their positions fit."""
+    """Find markers' rotations that scatter although their positions fit."""
     session.require_samples()
     if not np.isfinite(session.rotations).any():
         raise NotApplicable("no marker's whole pose was measured")
@@ -125,7 +125,7 @@ def scatter(session: RecordedSession) -> Findings:
 
 
 def _positions_alone(session: RecordedSession) -> RecordedSession | None:
-    """Return the session as acquire.centres reads a table's markers; None where none was read."""
+    """Return the session with the markers' positions alone; None unless they are from a table."""
     table = {} if isinstance(session.reader, str) else session.reader.get("table", {})
     target = table.get("target")
     if not isinstance(target, Mapping) or "columns" not in target:
@@ -152,6 +152,7 @@ def _flipped(
     seen = unknowns.rotation[0] @ session.rotations
     apart = seen.swapaxes(-1, -2) @ expected
     candidates = np.stack(list(FLIPS.values()))
+    # trace(R^T F) = 1 + 2 cos of the angle between them
     cosines = (np.einsum("nij,fij->nf", apart, candidates) - 1) / 2
     best = np.argmax(cosines, axis=1)
     # A flip explains a rotation that is within this of it [rad]
@@ -170,7 +171,7 @@ LITTLE = np.radians(10.0)
 
 @part("check.motion")
 def motion(session: RecordedSession) -> Findings:
-    """The poses do not determine the camera's pose: too little rotation, or all on a line."""
+    """Find motion that leaves the camera's pose unknown: too little rotation, or a single line."""
     session.require_samples()
     null = fit_of(session)
     turn, shift = _uncertainty(session, null)
@@ -221,8 +222,7 @@ def _advice(needs: bool, one_axis: bool) -> str:
 def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, float]:
     """Return the largest standard deviation of the camera's rotation, and at the work [rad, m].
 
-    With errors as large as :data:`ERRORS` at most: what larger ones leave open, motion does not
-    tell.
+    Errors count up to 3 mm and 1 deg only: more motion does not make up for larger ones.
     """
     scales = null.scales[0]
     # Larger ones [m, rad] are a mistake's or an outlier's, and no motion makes up for them
@@ -231,6 +231,7 @@ def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, fl
     covariance = share**2 * covariance_of(null.information[0])[:6, :6]
     work = null.unknowns.rotation[0] @ np.nanmean(session.centres, axis=0)
     at_work = levers(work)
+    # The largest eigenvalue is the variance in the least certain direction.
     turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]
     shift = np.linalg.eigvalsh(at_work @ covariance @ at_work.T)[-1]
     return float(np.sqrt(max(turn, 0.0))), float(np.sqrt(max(shift, 0.0)))
@@ -239,7 +240,7 @@ def _uncertainty(session: RecordedSession, null: VariantFits) -> tuple[float, fl
 def _rotations(session: RecordedSession) -> tuple[float, float]:
     """Return the largest turn between two poses, and the largest about a second axis [rad].
 
-    Of target and camera against each other; of two arms that which turned less.
+    They are turns between target and camera; with two arms, of the arm that turned less.
     """
     if session.seconds is not None:
         return min(_turns(p[session.seen]) for p in (session.poses, session.seconds))
@@ -249,13 +250,15 @@ def _rotations(session: RecordedSession) -> tuple[float, float]:
 def _turns(poses: Floats) -> tuple[float, float]:
     turns = poses[:, :3, :3]
     between = log_of(turns[:, None].swapaxes(-1, -2) @ turns[None]).reshape(-1, 3)
+    # Principal axes of all pairwise rotation vectors: two of them must be long, since rotation
+    # about one axis alone leaves the translation along it unknown (Tsai and Lenz 1989).
     _, _, axes = np.linalg.svd(between, full_matrices=False)
     along = np.abs(between @ axes.T).max(axis=0)
     return float(np.linalg.norm(between, axis=1).max()), float(along[1])
 
 
 def _offset_unknown(session: RecordedSession) -> Findings:
-    """Note where a constant offset of the target could not be seen."""
+    """Yield a note if the motion could not show a constant offset of the target."""
     if not np.isfinite(session.places).all() or session.carried == "camera":
         return
     if not (known := offset_left_open(session)):

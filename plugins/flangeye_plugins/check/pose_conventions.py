@@ -62,7 +62,7 @@ class Reread(NamedTuple):
 
 @part("check.convention")
 def convention(session: RecordedSession) -> Findings:
-    """The rotations fit far better when their numbers are read in another convention."""
+    """Find rotations that fit far better when their numbers are read in another convention."""
     session.require_poses()
     tried = [*_written_otherwise(session)] or [*_of_arms(session), *_of_markers(session)]
     evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
@@ -125,7 +125,7 @@ def _of_arms(session: RecordedSession) -> Iterator[Reread]:
 
 
 def _of_markers(session: RecordedSession) -> Iterator[Reread]:
-    """Yield other readings of ready-made markers' rotations, alone and with the arms'."""
+    """Yield the markers' rotations read in other conventions, alone and with the arms'."""
     if not _has_ready_made_markers(session):
         return
     stated = _stated(session, "target")
@@ -161,7 +161,7 @@ def _rereading(read_as: str, written_as: str) -> Change:
 
 
 def _readings(stated: str | None) -> Iterator[tuple[str, str]]:
-    """Yield (as read, as written): every pair of conventions with as many numbers."""
+    """Yield each pair of conventions, assumed and possible, that have the same number of values."""
     # What three angles mean on the arms that are sold, and rotation vectors
     common = ("vector", "ZYX", "xyz", "XYZ", "zyx", "ZYZ", "zyz", "ZXZ")
     for read_as in [stated] if stated else [*QUATERNIONS, *common]:
@@ -179,7 +179,7 @@ def _stated(session: RecordedSession, of: str | None = None) -> str | None:
 
 @part("check.direction")
 def direction(session: RecordedSession) -> Findings:
-    """The poses are those of the base in the flange, not of the flange in the base."""
+    """Find poses of the base in the flange, where the recipe expects the flange in the base."""
     session.require_poses()
     tried = [*_turned_round(session), *_transposed_markers(session)]
     evidence = best_of(fit_of(session), fit(equations_of(*(each for each, _, _ in tried))))
@@ -196,7 +196,10 @@ def direction(session: RecordedSession) -> Findings:
 
 @part("check.exchanged")
 def exchanged(session: RecordedSession) -> Findings:
-    """The recordings fit as well with robot's and markers' poses both inverted, and rather so."""
+    """Find poses of robot and marker that are both inverted, by where camera and target are.
+
+    Both readings fit the data alike, so only plausible distances decide.
+    """
     session.require_poses()
     if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
         raise NotApplicable("camera and target cannot stand for each other")
@@ -217,7 +220,7 @@ def exchanged(session: RecordedSession) -> Findings:
 
 @part("check.axes")
 def axes(session: RecordedSession) -> Findings:
-    """The camera's frame has other axes than x right, y down, z forward."""
+    """Find a camera frame whose axes are not x right, y down, z forward."""
     session.require_samples()
     if not _has_ready_made_markers(session):
         raise NotApplicable("the markers were found in images or clouds, whose frame is known")
@@ -237,7 +240,7 @@ def axes(session: RecordedSession) -> Findings:
 
 @part("check.mirrored")
 def mirrored(session: RecordedSession) -> Findings:
-    """Positions have an axis with the wrong sign, or two columns that stand for each other."""
+    """Find positions with the wrong sign along an axis, or with two columns exchanged."""
     session.require_samples()
     # Where each axis would do, one that leaves targets before the camera; beside z, y (OpenGL)
     before = bool(np.nanmedian(session.centres[:, 2]) > 0)
@@ -267,7 +270,7 @@ def _with_negated(session: RecordedSession, axis: str) -> RecordedSession:
 
 
 def _with_exchanged_columns(session: RecordedSession) -> Iterator[tuple[str, str, RecordedSession]]:
-    """Yield the recordings read again, two of the columns of a table's positions exchanged."""
+    """Yield the recordings read with two of a table's position columns exchanged."""
     for whose, of in (("robot", None), ("target", "target")):
         columns = _params(session, of).get("columns")
         if session.again is None or _said(session, of) is None or not isinstance(columns, list):
@@ -283,7 +286,7 @@ def _with_exchanged_columns(session: RecordedSession) -> Iterator[tuple[str, str
 
 
 def _distances(session: RecordedSession) -> tuple[float, float]:
-    """Return the distances of one from the flange, and of the other from the base [m]."""
+    """Return how far the carried device is from the flange, and the fixed one from the base [m]."""
     found = fit_of(session).unknowns
     near, far = found.place[0].mean(axis=0), found.position[0]
     if session.carried == "camera":
@@ -310,7 +313,7 @@ def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSess
 
 
 def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
-    """Whether exchanging camera and target has the same effect as inverting the poses."""
+    """Whether inverted poses cannot be told from camera and target mounted the other way round."""
     unknown = not np.isfinite(session.places).any()
     return session.links is None and session.seconds is None and unknown
 
@@ -320,7 +323,7 @@ def _meant(session: RecordedSession) -> list[Reading]:
 
 
 def _after_inverting(reading: Reading) -> Reading:
-    """Return a reading of poses of which the arm's were inverted, as one of those as recorded."""
+    """Convert a reading of inverted arm poses to one of the poses as recorded."""
     if reading.exchanged:
         return reading._replace(marker_inverted=not reading.marker_inverted)
     return reading._replace(robot_inverted=not reading.robot_inverted)
@@ -329,7 +332,7 @@ def _after_inverting(reading: Reading) -> Reading:
 def _choices(
     session: RecordedSession, readings: Sequence[Reading]
 ) -> tuple[str, str, str, RecordedSession]:
-    """Return the mistake in a word and in words, the lines to choose from, and what is meant."""
+    """Return the mistake's name and text, the lines to choose from, and the corrected session."""
     in_hand = session.carried == "camera"
     what = ", or ".join(dict.fromkeys(each.mistake(in_hand) for each in readings))
     made = [_read_so(session, each) for each in readings]
@@ -339,7 +342,7 @@ def _choices(
 
 
 def _read_so(session: RecordedSession, reading: Reading) -> tuple[str, RecordedSession]:
-    """Return a line of the recipe, and the session by it: of two, that of the mounting first."""
+    """Return the recipe line for a reading, and the session read with it."""
     if reading.remounted:
         name = "eye-on-base" if session.carried == "camera" else "eye-in-hand"
         held: Literal["camera", "target"] = "target" if name == "eye-on-base" else "camera"

@@ -42,13 +42,13 @@ ARMS = (0.1, 4.0)
 
 
 class OtherUnit(NamedTuple):
-    """Another unit of some of the lengths.
+    """A session with some lengths read in another unit.
 
     Attributes:
-        session: As it would be.
-        said: Unit they were read in.
-        meant: Unit they may be in.
-        arms: Whose positions; None for the target's.
+        session: With these lengths in the other unit.
+        said: Unit in which they were read.
+        meant: Unit in which they may be written.
+        arms: Arms whose positions are concerned; None for the target's.
     """
 
     session: RecordedSession
@@ -59,7 +59,7 @@ class OtherUnit(NamedTuple):
 
 @part("check.units")
 def units(session: RecordedSession) -> Findings:
-    """Positions of the arm or the target are in another unit than stated."""
+    """Find positions of arm or target whose unit is not the stated one."""
     session.require_samples()
     tried = list(_alternatives(session))
     evidence = best_of(fit_of(session), fit(equations_of(*(each.session for each in tried))))
@@ -73,9 +73,12 @@ def units(session: RecordedSession) -> Findings:
 
 
 def _alternatives(session: RecordedSession) -> Iterator[OtherUnit]:
-    """Yield other units of the arms' positions, and of the target's where that is not the same.
+    """Yield the session with positions of arms or target in other units.
 
-    A link's place follows from the arm's model, in metres: then it is not.
+    Scaling the target's positions has the same effect as scaling the arm's inversely, so only one
+    is tried.
+
+    The exception is a camera on a link, whose position follows from the arm's model in metres.
     """
     for said, meant, factor in _ratios():
         if session.uses_poses:
@@ -120,7 +123,7 @@ def _finding(session: RecordedSession, found: OtherUnit, evidence: Significance)
 
 
 def _of_targets_unit(session: RecordedSession, found: OtherUnit, evidence: Significance) -> Finding:
-    """Return that the target's lengths are wrong; the arm's in the inverse unit fit as well."""
+    """Return a finding for the target's lengths, given one for the arm's that fits equally well."""
     said, meant = found.said, found.meant
     if found.arms is not None:
         said, meant = meant, said
@@ -137,7 +140,7 @@ def _refitted(what: str, corrected: RecordedSession, evidence: Significance) -> 
 
 
 def _rather_target(session: RecordedSession, said: str, meant: str) -> bool:
-    """Return whose lengths are wrong: of arm and target, the one that they make more plausible."""
+    """Return whether the target's unit is the more plausible mistake, judged by usual distances."""
     if session.links is not None:
         return False
     factor = METRES[meant] / METRES[said]
@@ -159,9 +162,9 @@ def _of_target(session: RecordedSession, factor: float, unit: str) -> RecordedSe
 
 
 def _too_far(session: RecordedSession) -> Finding | None:
-    """Name the unit of places that are ten times further than arms reach, or scanners see.
+    """Return a finding for positions ten times beyond an arm's reach or a scanner's range.
 
-    That needs no calibration that fits: there may be other mistakes.
+    It needs no calibration, so it works when there are other mistakes as well.
     """
     arm, target = _distance_of_arm(session), _distance_of_target(session)
     lengths = {"robot": (arm, ARMS), "target": (target, session.reach)}
@@ -193,7 +196,8 @@ def _distance_of_target(session: RecordedSession) -> float:
 
 
 def _outside(distance: float, allowed: tuple[float, float]) -> float:
-    """Return by how many e-folds a distance is outside a range; 0 inside."""
+    """Return the logarithm of the factor by which a distance is outside a range; 0 inside."""
+    # On a logarithmic scale: a unit mistake is a factor, and a range of distances spans decades.
     low, high = np.log(allowed)
     value = np.log(max(distance, 1e-12))
     return float(max(low - value, value - high, 0.0))
@@ -210,7 +214,7 @@ wrong focal length does (Zhang 2000, equation 2), its depth alone."""
 
 @part("check.size")
 def size(session: RecordedSession) -> Findings:
-    """The target's distances are off by one factor: its size is wrong, or the focal length."""
+    """Find a wrong target size or focal length, which scales all distances of the target."""
     session.require_samples()
     marker = bool(np.isfinite(session.rotations).any())
     if not marker and not np.isfinite(session.places).all():
@@ -232,6 +236,7 @@ def size(session: RecordedSession) -> Findings:
         p = size_by_chance(session)
     if p == 1 or not explained(corrected_session):
         return
+    # Bonferroni, over size and focal length
     evidence = evidence._replace(probability=min(1.0, len(tried) * p))
     if marker:
         what, fix = _wrong_marker(session, kind, factor)
@@ -270,7 +275,7 @@ def _stretched(
 
 
 def _factor(session: RecordedSession, null: VariantFits, along: Floats) -> float:
-    """Return by how much coordinates must grow; linear once the rotations are known.
+    """Return the best factor of the target's coordinates, given the rotations (linear).
 
     Args:
         session: The samples.
@@ -297,7 +302,7 @@ def _factor(session: RecordedSession, null: VariantFits, along: Floats) -> float
 
 @part("check.rounding")
 def rounding(session: RecordedSession) -> Findings:
-    """Positions are rounded as coarsely as the error that the recipe asks for."""
+    """Find positions rounded more coarsely than the error that the recipe asks for."""
     seen = session.centres[session.seen]
     for whose, places in (("the arm", session.poses[:, :3, 3]), ("the target", seen)):
         step = _step(places)
@@ -325,7 +330,7 @@ def _step(places: Floats) -> float | None:
 
 
 def _calibrate_camera(session: RecordedSession) -> str:
-    """Return the line that finds the camera by its views of the board, where it sees one."""
+    """Return the recipe line that calibrates the camera from the board, or advice to do so."""
     if session.acquire == "acquire.images" and session.board:
         return session.with_changes(board=dict(session.board)).step()
     return "calibrate the camera by views of a board"
