@@ -279,7 +279,7 @@ class Import:
         self._box.classes("w-full").props("dense")
 
     def _words(self) -> list[str]:
-        """Return the command's: each line of a box is an option, each part of it a word."""
+        """Return the command's words, with an option for each line of each box."""
         words = [f"new-{self._section}", self._name.value or "my_model"]
         for option, box in self._given.items():
             for line in filter(None, (box.value or "").splitlines()):
@@ -436,7 +436,7 @@ class WhatRuns:
         return self._rows
 
     def _choice(self, option: str, title: str, lines: dict[str, str]) -> None:
-        """Show what may answer an option of the command; the only one is chosen."""
+        """Show the choices for an option of the command; a single one is selected."""
         # Others move the arm, or the camera runs by itself.
         none = {"none": "none of these"} if option in ("trajectory", "trigger") else {}
         ui.label(title if lines else f"{title}: none runs")

@@ -187,7 +187,7 @@ class Project:
     def write_step(self, name: str, params: Mapping[str, Any]) -> None:
         """Set a step's parameters in the recipe; add the step at its place if it is missing.
 
-        Of kinds that a recipe has one of, the step that is there makes room.
+        If a recipe can have only one step of this kind, the present one is replaced.
         """
         data = self.data()
         steps, known = list(data.get("steps") or []), self.steps()

@@ -1,4 +1,4 @@
-"""A seam whose planning error is chosen, to study what following it by touch makes of that."""
+"""A seam with a chosen planning error, for studies of how touch corrects it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Open3D up to 0.7 did to the paper's ICP, done again. Arrays only; an emulation.
+"""Emulation of the faulty normals of Open3D up to 0.7, on which the paper's ICP ran. Arrays only.
 
 Up to version 0.7 (the data are of 2018-12 to 2019-06) Open3D found the normal of a neighbourhood
 with covariance A as a column of ``(A - l0 I)(A - l1 I)``, l0 >= l1 >= l2 its eigenvalues. Where the

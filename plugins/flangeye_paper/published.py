@@ -95,9 +95,9 @@ class PublishedParams(CentresParams):
 def acquire_published_centres(
     archive: ArchivePath, views: Views | None, seed: Seed, params: PublishedParams
 ) -> Observations:
-    """Take the authors' circle centres, and their verification cloud where it was published.
+    """Read the authors' circle centres, and their verification cloud if it was published.
 
-    What acquire.centres gives, and a view for ``error.icp_as_in_paper`` and
+    The result is that of acquire.centres, with a view for ``error.icp_as_in_paper`` and
     ``verify.icp_as_in_paper``. The archive is the whole published folder.
     """
     centres: Observations = acquire_centres(archive, params)

@@ -1,6 +1,6 @@
-"""The built-in plugins, one folder a kind; offered through the same door as a vendor's.
+"""The built-in plugins, one folder for each kind, registered like a vendor's.
 
-By name and place: a module is imported when a recipe uses what is in it.
+They are offered as names with import paths, so a module is imported only when a recipe uses it.
 """
 
 from collections.abc import Callable, Mapping

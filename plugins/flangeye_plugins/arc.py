@@ -150,7 +150,7 @@ class UrDigitalArc(Device):
         self._asked("S", b"")
 
     def _asked(self, kind: str, body: bytes) -> bytes:
-        """Return the answer to a request; what else comes meanwhile is passed over."""
+        """Return the answer to a request; other packages that arrive meanwhile are skipped."""
         self._say(kind, body)
         while time.monotonic() < self._until:
             self._receive(0.05)

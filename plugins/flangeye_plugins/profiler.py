@@ -1,10 +1,10 @@
 """``profiler.*``: sensors that measure the bead behind the torch. Add one: a new module.
 
-Profile sensors with an evaluation of their own, which send what they measure as lines of text.
+Such sensors evaluate each profile themselves and send the result as lines of text.
 
-Such a sensor is set up in its maker's program to find bead and joint in each profile, and sends how
-far one lies from the other over TCP, a line for each profile. Which of a line's columns that is, in
-which unit and to which side, the recipe states. A column that holds no number is not a look.
+In the maker's program the sensor is set up to find bead and joint, and to send the bead's offset
+from the joint over TCP, one line for each profile. The recipe states the column of the offset, its
+unit and its sign. A line without a number in that column is skipped.
 """
 
 from __future__ import annotations

@@ -59,12 +59,11 @@ def refine_compensate(
     """Apply the error measured on a verification view to the answer: equation (19).
 
     The error takes the measured flange onto the predicted one, in ``camera``, so it goes to the
-    right: ``base_T_camera @ error`` puts what was measured where the robot reports it. That order,
-    the paper's, holds for an error of this direction only.
-
-    The answer then is right for that one view, its noise, the arm's error there and the flange's
-    own roll included: the notes say what it does to the poses that were solved from. The
-    covariance grows by the step taken, as if it were one standard deviation.
+    right: ``base_T_camera @ error`` puts what was measured where the robot reports it. This order,
+    which is the paper's, is correct for an error of this direction only. The result fits that one
+    view, including its noise, the arm's error there and the flange's roll. The notes state the
+    effect on the poses used for solving. The covariance grows by the step taken, as if it were one
+    standard deviation.
 
     Raises:
         StageError: There is no verification view, or the recipe names no robot.
@@ -172,10 +171,10 @@ def refine_arm(
 ) -> HandEye:
     """Estimate the arm's observable joint zeros and link lengths, and correct the arm by them.
 
-    The pose for the arm as its controller reports it stays; the pose for the arm so corrected is
-    put beside it, if it is expected to help. The notes say which parameters the poses identify
-    and which not, and propose poses that would identify more. ``export.robot`` writes the corrected
-    arm as a robot file.
+    The pose for the arm as its controller reports it is kept. A second pose, for the corrected arm,
+    is added if the correction is expected to help. The notes list the parameters that the poses
+    identify, and propose poses that would identify more. ``export.robot`` writes the corrected arm
+    as a robot file.
 
     Raises:
         StageError: There are too few poses, or the robot's model does not reach them.
@@ -223,7 +222,7 @@ def _combinations(told: ArmParameters) -> str:
 
 
 def _listed(told: ArmParameters) -> list[str]:
-    """Name what is identified, with value and deviation, and what is not, where anything is."""
+    """Return notes with the identified parameters, and those not identified; empty without any."""
     single: list[str] = []
     combined_only: list[str] = []
     for (joint, which), singly in np.ndenumerate(told.identified):
@@ -269,7 +268,7 @@ def _proposed(session: Session, told: ArmParameters, count: int) -> list[str]:
 
 
 def _candidates(session: Session) -> list[Observation]:
-    """Return sightings about the session's, as near and as square as the camera saw those."""
+    """Return predicted sightings around the session's, at similar distances and incidence."""
     arm, at = known(next(c for c in session.found.problem.carriers if c.frame == FLANGE))
     rng, places = np.random.default_rng(0), session.found.places
     joints = at[rng.integers(len(at), size=300)]

@@ -110,9 +110,9 @@ def scan_along(  # noqa: PLR0913  what it asks the runner for
 ) -> WorkpieceScan:
     """Drive the scanner along a seam and scan it from evenly spaced places.
 
-    At each the scanner, as it was calibrated, looks straight at the seam. Every pose and every way
-    between two is checked before the arm sets off; the scanner's own body is not known to these
-    checks. Each cloud comes with where the controller had the arm.
+    At each place the scanner faces the seam, by its calibrated pose. Every pose and path is checked
+    before the arm moves; the checks do not know the scanner's own shape. Each cloud is stored with
+    the arm's pose as its controller reported it.
 
     Raises:
         StageError: The scanner is not on the flange, or a place cannot be reached.

@@ -253,7 +253,7 @@ def image_of(pixels: NDArray[np.uint8], finger: Finger) -> Image:
 
 
 def piece_of(pixels: NDArray[np.uint8], corner: Sequence[int], finger: Finger) -> ImageRegion:
-    """Return logged pixels (h, w) as the piece they are of an image of the finger's camera."""
+    """Return logged pixels (h, w) as a region of the finger camera's image."""
     start = (int(corner[0]), int(corner[1]))
     matrix = shifted(finger.camera.matrix, start)
     return ImageRegion(Image(pixels, matrix, np.array(finger.camera.distortion)), start)

@@ -47,9 +47,9 @@ class ShownParams(Params):
 def view_shown(arm: Arm, scanner: ScannerModel, params: ShownParams) -> Floats:
     """Estimate the scanner's pose from jogged poses in which the flange faces it.
 
-    The scanner stands where the flanges' axes come closest to one another; where they are nearly
-    parallel, ahead of the flanges' middle by the distance it works at. Its turn about the view is
-    not known, and not needed: poses are planned within the smaller of its two angles of view.
+    The scanner's position is the point closest to all flange axes. If they are nearly parallel, it
+    is at the scanner's working distance ahead of the flanges' mean. The rotation about the optical
+    axis stays unknown. It is not needed, as poses are planned within the smaller angle of view.
 
     Returns:
         (4, 4) base_T_camera.

@@ -109,9 +109,9 @@ def size_of(problem: Problem) -> float:
 
 
 def _sized_translations(carried: Floats, seen: Floats, turn: Floats) -> tuple[Floats, Floats]:
-    """Return (N, 3, 7) equations of two unknown shifts and the size, and (N, 3) right sides.
+    """Return (N, 3, 7) equations of two unknown translations and the scale, and (N, 3) right sides.
 
-    They belong to the loop ``G X M = Z``, with the translation of M times the size.
+    They belong to the loop ``G X M = Z``, with the translation of M multiplied by the scale.
     """
     turns, still = carried[:, :3, :3], np.broadcast_to(-np.eye(3), (len(seen), 3, 3))
     sized = turns @ (seen[:, :3, 3] @ turn.T)[..., None]

@@ -1,7 +1,7 @@
 """Read a camera's calibration from the files of common programs.
 
-``camera_info`` of ROS, OpenCV's storage, kalibr's camchain, COLMAP's ``cameras.txt``, RealSense's
-and Zivid's intrinsics, arrays of NumPy, and text with labels.
+These are ROS's ``camera_info``, OpenCV's FileStorage, kalibr's camchain, COLMAP's ``cameras.txt``,
+RealSense's and Zivid's intrinsics, NumPy arrays, and text with labels.
 """
 
 from __future__ import annotations

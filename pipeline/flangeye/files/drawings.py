@@ -1,6 +1,7 @@
 """Lines of a DXF drawing: LINE, ARC, CIRCLE, LWPOLYLINE and POLYLINE of the ASCII format.
 
-Pairs of lines, a group code and its value: AutoCAD's DXF reference. Everything else is passed over.
+A DXF file consists of pairs of lines: a group code and its value (AutoCAD's DXF reference). Other
+entities are skipped.
 """
 
 from __future__ import annotations

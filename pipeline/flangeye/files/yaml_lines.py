@@ -167,7 +167,7 @@ def _build_mapping(
 
 
 def _scalar(text: str, plain: bool) -> Any:
-    """Return the value of a scalar; only plain ones, without quotes, can be other than text."""
+    """Return the value of a scalar; a quoted one is always text."""
     if not plain:
         return text
     words = {"null": None, "~": None, "": None, "true": True, "false": False}
@@ -190,7 +190,7 @@ class Edit(NamedTuple):
 def edited(text: str, data: Mapping[Any, Any]) -> str:
     """Return a YAML text that holds ``data``, rewritten only where its values differ.
 
-    Comments stay, but for those inside a value that is gone or is of another kind now.
+    Comments are kept, except those inside a value that was removed or changed its type.
 
     Args:
         text: A mapping in YAML.
@@ -209,7 +209,7 @@ def edited(text: str, data: Mapping[Any, Any]) -> str:
 
 
 def _holds(text: str, data: Mapping[Any, Any]) -> bool:
-    """Return whether the edited text holds ``data``; some nested lists have no room for edits."""
+    """Return whether the edited text holds ``data``; edits fail for some nested lists."""
     try:
         return bool(parse_yaml(text, "recipe").data == data)
     except RecipeError:
@@ -221,7 +221,7 @@ def _whole(data: Mapping[Any, Any]) -> str:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes in quotes each text that :func:`read_yaml` would take for a number: 08, 1e3."""
+    """YAML writer that quotes texts which :func:`read_yaml` would read as numbers: 08, 1e3."""
 
     def represent_text(self, text: str) -> yaml.Node:
         style = None if _scalar(text, plain=True) == text else "'"
@@ -318,7 +318,7 @@ def _in_list(
 
 
 def _without_lines(text: str, start: int, end: int) -> Edit:
-    """Return the edit that takes the lines out that a block's entry stands on."""
+    """Return the edit that deletes the lines of an entry of a block."""
     after = text.find("\n", end)
     return Edit(_line_start(text, start), len(text) if after < 0 else after + 1, "")
 

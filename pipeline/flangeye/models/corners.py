@@ -112,11 +112,11 @@ def board_seen(view: Grey) -> SeenBoard | None:
 
 
 def _board_of(dictionary: str, ids: list[int], grey: Grey) -> SeenBoard:
-    """Return the board that markers belong to: the ChArUco board whose corners are found.
+    """Return the ChArUco board that the markers belong to, or the markers alone.
 
-    The markers of a board are numbered row by row, so corners between them are found with the right
-    number of columns only. Rows are as many as hold the markers: of those out of the image nothing
-    is known. Others are markers alone.
+    Markers are numbered row by row, so their corners are found only if the number of columns is
+    right. The number of rows is the smallest that holds the seen markers, because rows outside the
+    image are unknown.
     """
     import cv2
 

@@ -1,8 +1,9 @@
 """A UR's factory calibration: the arm as built, read from files that its users have.
 
-Two of them: ``calibration.conf`` from the controller (``/root/.urcontrol``), what has to be added
-to the Denavit-Hartenberg table; and the ``kinematics`` file that the ROS driver's
-``calibration_correction`` writes (``default_kinematics.yaml`` is its shape), joints' origins.
+There are two such files. ``calibration.conf`` of the controller (in ``/root/.urcontrol``) holds
+corrections to the Denavit-Hartenberg table. The file that the ROS driver's
+``calibration_correction`` writes, in the format of ``default_kinematics.yaml``, holds the joints'
+origins.
 """
 
 from __future__ import annotations

@@ -310,7 +310,7 @@ def _joint(urdf: Urdf, joint: ET.Element, pose: Floats) -> Joint:
 def _notes(
     urdf: Urdf, robot: RobotModel, base: str, flange: str, bodies: UrdfBodies
 ) -> Iterator[Note]:
-    """Yield which links were taken, and what is odd about them."""
+    """Yield notes on the links used as base and flange, and warnings about them."""
     yield f"{urdf.path}: base '{base}', flange '{flange}'"
     if (odd := _sideways(urdf, robot, flange)) is not None:
         yield odd
@@ -325,7 +325,7 @@ def _notes(
 
 
 def _sideways(urdf: Urdf, robot: RobotModel, flange: str) -> Warn | None:
-    """Return a warning where the flange's z is not along the last axis, which says what is."""
+    """Return a warning if the flange's z is not along the last joint's axis; None if it is."""
     joint, end = robot.joints[-1], robot.link_T_flange
     axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
     # How far the flange is along the axis from the joint before shows which way is outwards.
@@ -356,8 +356,8 @@ def _axis_name(direction: Floats) -> str:
 def _base(urdf: Urdf, asked: str | None, to_flange: list[ET.Element]) -> str:
     """Return the base's link.
 
-    As asked, else the frame that ROS-Industrial calls ``base``, else where the first moving joint
-    stands.
+    It is the requested link, else the frame that ROS-Industrial calls ``base``, else the parent of
+    the first moving joint.
     """
     if asked is not None:
         return _known(urdf, asked, "base")

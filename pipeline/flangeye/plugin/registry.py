@@ -141,7 +141,7 @@ class Registry:
         return offered[name]()
 
     def exports(self) -> list[Stage]:
-        """Return the formats that ask for the camera's pose alone, in the order of their offering.
+        """Return the export formats that need the camera's pose alone, in the plugins' order.
 
         An export that asks for more, such as the robot, is a step of a recipe only.
         """

@@ -109,7 +109,7 @@ class RobotConformance(DriverConformance):
     kind = "robot"
 
     def test_it_says_where_it_is(self) -> None:
-        """A sample in metres, in frames, new, and as the model's own kinematics have it."""
+        """The sample is recent, in metres, and agrees with the model's kinematics."""
         with self.opened() as robot:
             require(isinstance(robot, Robot), "it lacks methods of flangeye.devices.Robot")
             state = robot.state()
@@ -124,7 +124,7 @@ class RobotConformance(DriverConformance):
             require(0 < robot.period < 0.1, f"a period of {robot.period} s")
 
     def test_time_goes_on(self) -> None:
-        """Each cycle has a sample of its own."""
+        """Each control cycle gives a new sample, later than the last one."""
         with self.opened() as robot:
             first = robot.state().time_ns
             for _ in range(20):
@@ -368,7 +368,7 @@ class ProfilerConformance(StreamConformance):
         return {StateSource: _Standing(), TactileSensor: None}
 
     def test_its_profiles_are_in_metres(self) -> None:
-        """With how well each is known, at a fixed way behind the torch."""
+        """Each profile has an offset and its standard deviation in metres, at a fixed distance."""
         with self.opened() as profiler:
             require(isinstance(profiler, Profiler), "it lacks methods of devices.Profiler")
             looks, behind = self.given(profiler, 5), profiler.behind

@@ -257,7 +257,7 @@ class SegmentConformance(PerCaptureConformance):
         return {Capture: scene.capture()}
 
     def test_its_cloud_is_cut_from_the_scan(self) -> None:
-        """Every point of it is one of the scan's, near the feature, and finite."""
+        """Every point of the segmented cloud is a finite point of the scan, near the feature."""
         value, scene = self.answer()
         cloud = require_type(value, FlangeCloud).cloud
         require(cloud.frame == CAMERA, f"the cloud is in '{cloud.frame}', not in '{CAMERA}'")

@@ -211,7 +211,7 @@ class PlanConformance(Conformance):
         require(spread[1] > 0.02 * np.sqrt(len(centres)), "all poses are on a line")
 
     def test_it_moves_with_the_site(self) -> None:
-        """Scanner and work elsewhere, the poses with them."""
+        """If scanner and work are moved, the planned poses move with them."""
         shift = np.array([0.1, -0.2, 0.05])
         here, there = self.poses(), self.poses(moved=shift)
         require_close(there[:, :3, 3], here[:, :3, 3] + shift, 1e-6, "a pose of a moved site [m]")

@@ -375,7 +375,7 @@ def plain_rotation(rotation: str) -> str:
 
 
 def other_conventions(rotation: str, angle: str | None) -> Iterator[RotationConvention]:
-    """Yield what as many numbers may be instead, angles in either unit; nothing for a matrix."""
+    """Yield other conventions with as many values, angles in both units; none for a matrix."""
     if not is_known(rotation):
         return
     if plain_rotation(rotation) in QUATERNIONS:

@@ -47,8 +47,8 @@ class GridParams(PlanParams):
 def grid(site: Site, rng: np.random.Generator, params: GridParams) -> Plan:
     """Visit a grid of points in random order, each in a random orientation facing the scanner.
 
-    The paper's plan (section 3.1: 5 x 5 x 3 points over 0.3 x 0.3 x 0.2 m; roll, pitch and yaw
-    below 0.3 rad in 3.2.1). A grid point where no orientation is possible is left out.
+    This is the paper's plan: 5 x 5 x 3 points over 0.3 x 0.3 x 0.2 m (section 3.1), with roll,
+    pitch and yaw below 0.3 rad (3.2.1). Grid points without a possible orientation are left out.
 
     Args:
         site: The place.
@@ -96,10 +96,10 @@ class NextBestParams(PlanParams):
 def next_best(site: Site, rng: np.random.Generator, params: NextBestParams) -> Plan:
     """Choose each next pose to reduce the expected error at the work most.
 
-    Greedy A-optimal design (Pukelsheim 1993): of many poses drawn in the region, the one that
-    leaves the smallest expected square error over the work, given the poses visited before. Poses
-    that gave nothing do not count. Candidates are checked best first, so that inverse kinematics is
-    solved for a few only.
+    This is greedy A-optimal design (Pukelsheim 1993). Of many random poses in the region it takes
+    the one with the smallest expected square error over the work, given the poses visited before.
+    Poses without a measurement do not count. Candidates are checked best first, so that inverse
+    kinematics is solved for a few only.
     """
     centre = site.centre if params.centre is None else np.asarray(params.centre)
     size = np.asarray(params.size)

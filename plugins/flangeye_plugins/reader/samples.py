@@ -1,15 +1,20 @@
 """Sample files of other tools, each read through ``reader.table``.
 
-easy_handeye and easy_handeye2 (IFL-CAMP, marcoesposito1988): ``samples:``, a list of ``robot`` and
-``tracking`` transforms, or ``hand_world_samples`` and ``camera_marker_samples``; metres, xyzw. The
-marker's pose is in the camera. The robot's is base_T_effector for eye-in-hand, and for eye-on-base
-its inverse: both tools solve eye-on-base as if it were eye-in-hand (``handeye_sampler.py``,
-``_get_transforms``). MoveIt Calibration's RViz panel: a list of ``effector_wrt_world`` and
-``object_wrt_sensor``, 4x4 matrices row by row in metres, for either mounting
-(``handeye_control_widget.cpp``, ``saveSamplesBtnClicked``). ViSP: ``pose_rPe_1.yaml`` is the flange
-in the base, ``pose_cPo_1.yaml`` the object in the camera, metres and rotation vector
-(``vpPoseVector``). Zivid's samples: ``pos01.yaml``, a matrix of the SDK (``FloatMatrix: Data:``) or
-of OpenCV (``PoseState``), with ``img01.ply`` beside it; millimetres in Zivid's own.
+easy_handeye and easy_handeye2 (IFL-CAMP, marcoesposito1988) write ``samples:``, a list of ``robot``
+and ``tracking`` transforms, or ``hand_world_samples`` and ``camera_marker_samples``, in metres with
+quaternions xyzw. The marker's pose is in the camera. The robot's pose is base_T_effector for
+eye-in-hand and its inverse for eye-on-base, because both tools solve eye-on-base as if it were
+eye-in-hand (``handeye_sampler.py``, ``_get_transforms``).
+
+MoveIt Calibration's RViz panel writes a list of ``effector_wrt_world`` and ``object_wrt_sensor``:
+4x4 matrices row by row in metres, for either mounting (``handeye_control_widget.cpp``,
+``saveSamplesBtnClicked``).
+
+ViSP writes the flange in the base to ``pose_rPe_1.yaml`` and the object in the camera to
+``pose_cPo_1.yaml``, each a position in metres and a rotation vector (``vpPoseVector``).
+
+Zivid's samples are ``pos01.yaml``, a matrix of the SDK (``FloatMatrix: Data:``) or of OpenCV
+(``PoseState``), with ``img01.ply`` beside it. Zivid's own are in millimetres.
 """
 
 from __future__ import annotations

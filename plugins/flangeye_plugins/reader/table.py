@@ -1,14 +1,16 @@
 """``reader.table``: a table of poses in any stated convention, with scans or targets.
 
-CSV and the like, one row a pose, with or without a heading, any separator, decimal points or
-commas: the scan's file name, if it is given, then the numbers of the pose; or whatever columns
-the recipe names. JSON, YAML, OpenCV's storage, NumPy and MATLAB: records, or arrays of one length
-side by side, with dotted columns; or a file a pose, by a pattern of their names. Robot programs: a
-row each position. Scans belong to rows by the name or number in common, or in their order.
+Text tables (CSV and the like) have one row per pose, with or without a heading, with any separator,
+and with decimal points or commas. A row holds the scan's file name, if given, then the numbers of
+the pose, unless the recipe names the columns. JSON, YAML, OpenCV, NumPy and MATLAB files hold
+records, or arrays of equal length, whose columns have dotted names. A pattern of names reads one
+file per pose. A robot program gives one row per position. Scans are matched to rows by a common
+name or number, or by order.
 
-What the camera measured may stand in the table in place of scans, as ``target``, and so may a
-second arm's pose, as ``second``; either in the same rows, or in a table of its own that is joined
-by time, by name or number, or row by row. Joint angles alone are poses by the recipe's robot.
+Instead of scans the table may hold the target's pose as the camera measured it (``target``), and a
+second arm's pose (``second``). Each is in the same rows, or in a separate table that is joined by
+time, by name or number, or row by row. Joint angles alone are converted to poses by the recipe's
+robot.
 """
 
 from __future__ import annotations

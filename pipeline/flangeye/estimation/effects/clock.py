@@ -1,4 +1,4 @@
-"""The time between a camera's clock and the arms', where these moved when the camera saw them."""
+"""The offset between a camera's clock and the arms', observable if an arm moved during captures."""
 
 from __future__ import annotations
 

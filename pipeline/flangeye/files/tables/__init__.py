@@ -1,14 +1,14 @@
 """Tables of poses as people and programs write them: text, documents, arrays, robot programs.
 
-A new kind of file is a function in :mod:`~flangeye.files.documents` and its row there, or a
-pattern in :data:`~flangeye.types.pose_formats.CONVENTIONS`.
+To read a new kind of file, add a function and its row to :mod:`~flangeye.files.documents`, or a
+pattern to :data:`~flangeye.types.pose_formats.CONVENTIONS`.
 
-Rows of poses, whatever file they are from.
+A name selects a table, or part of one.
 
-``poses.csv`` names a file; ``robot/*.txt`` files with a row each; ``log.txt:2`` the second block
-of rows of a text, ``log.txt:2/2`` the second half of its rows; ``log.csv:marker`` those rows that
-have a cell ``marker``; ``poses.npz:arm`` the arrays of a document that have as many entries as
-``arm``. Several names are tables side by side.
+``poses.csv`` is a file, and ``robot/*.txt`` are files with one row each. ``log.txt:2`` is the
+second block of rows of a text, and ``log.txt:2/2`` the second half of its rows. ``log.csv:marker``
+are the rows that have a cell ``marker``. ``poses.npz:arm`` are the arrays of a document that are as
+long as ``arm``. Several names are tables side by side.
 """
 
 from __future__ import annotations
@@ -290,10 +290,11 @@ def _counted(table: Table) -> tuple[str, ...]:
 
 
 def labelled_rows(file: Path, text: str, fewest: int = MIN_CAPTURES) -> Rows | None:
-    """Return numbers behind labels, a row for each time the labels come again; None if few are.
+    """Return the numbers behind labels, a new row each time the labels repeat; None if too few.
 
-    ``robot: x=0.1 y=0.2 …`` and ``[INFO] [17.2]: marker pose: [0.3, …]`` are such; a label with
-    numbers behind its colon is a list, one with other labels behind it begins their names.
+    Examples are ``robot: x=0.1 y=0.2 …`` and ``[INFO] [17.2]: marker pose: [0.3, …]``. Several
+    numbers behind a label form a list. A label that is followed by other labels is put before their
+    names.
     """
     one = r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?(?![\w.:])"
     # Over several lines, until another label
@@ -350,9 +351,9 @@ class TextBlock:
 def text_rows(file: Path, text: str) -> list[Rows]:
     """Return the blocks of a text, mostly one.
 
-    ``#``, ``%`` and ``//`` begin a comment, of which the last before the numbers may be the
-    heading. Blank lines and titles part blocks of three rows and more, and so do comments between
-    blocks of one length. Matrices that stand line by line are a row each.
+    ``#``, ``%`` and ``//`` begin a comment; the last one before the numbers may be the heading.
+    Blocks of three rows or more are separated by blank lines and titles, and blocks of equal length
+    by comments. A matrix written over several lines becomes one row.
     """
     blocks = [_with_matrices(_unfolded(block)) for block in _blocks(file, text.splitlines())]
     merged = _in_turn(blocks) or _merged(blocks)
@@ -406,7 +407,7 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
 
 
 def _unbroken(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Yield lines with their numbers; a list of numbers that is broken over some is one line."""
+    """Yield line numbers and lines; a list of numbers over several lines is joined into one."""
     begun, first = "", 0
     for n, line in enumerate(map(str.strip, lines), 1):
         begun, first = (f"{begun} {line}", first) if begun else (line, n)
@@ -419,14 +420,14 @@ def _unbroken(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
 
 
 def _list_in(cell: Cell) -> tuple[str, ...]:
-    """Return the numbers of a list that stands in one cell; empty where none does."""
+    """Return the numbers of a list in one cell; empty if the cell holds no list."""
     text = str(cell).strip()
     words = re.split(r"[\s,;\[\]()]+", text.strip("[]() ")) if text[:1] in ("[", "(") else []
     return tuple(words) if words[2:] and all(number_of(word) is not None for word in words) else ()
 
 
 def _unfolded(block: TextBlock) -> TextBlock:
-    """Return a block with a column for each number of the lists that stand in its cells."""
+    """Return a block in which each number of a list has its own column."""
     columns = zip(*(cells for _, cells in block.rows), strict=False)
     sizes = [max(len(_list_in(cell)) for cell in column) for column in columns]
     if any(sizes):
@@ -446,7 +447,7 @@ def _unfolded(block: TextBlock) -> TextBlock:
 
 
 def _with_matrices(block: TextBlock) -> TextBlock:
-    """Return a block whose matrices, line by line, are a row of numbers each."""
+    """Return a block in which each matrix over several lines is one row."""
     widths = {len(cells) for _, cells in block.rows}
     if not (len(block.heading) in widths or (block.marked and len(block.heading) > 2)):
         block.heading = ()
@@ -466,7 +467,7 @@ def _or_nan(cell: str | float) -> float:
 
 
 def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
-    """Return the blocks with those of one table merged: short ones, and those a comment parts."""
+    """Return the blocks, after merging those that belong to one table."""
     sections: list[TextBlock] = []
     # Rows of a block; fewer between blank lines are a pose each
     short = [block for block in blocks if len(block.rows) < 3]
@@ -486,7 +487,7 @@ def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
 
 
 def _in_turn(blocks: Sequence[TextBlock]) -> list[TextBlock]:
-    """Return one table for each of the titles that alternate: robot 0, marker 0, robot 1, …."""
+    """Return a table for each title, if titles alternate: robot 0, marker 0, robot 1, …."""
     sections: dict[str, TextBlock] = {}
     for block in blocks:
         title = re.sub(r"\W*\d+\W*$", "", block.title)
@@ -497,7 +498,7 @@ def _in_turn(blocks: Sequence[TextBlock]) -> list[TextBlock]:
 
 
 def _names(block: TextBlock, blocks: Sequence[TextBlock]) -> list[str]:
-    """Return the titles of rows that each have one."""
+    """Return the titles of a block's rows; empty unless each row has one."""
     titles = [each.title for each in blocks if each.rows[0] in block.rows]
     return titles if len(titles) == len(block.rows) > 1 and all(titles) else []
 

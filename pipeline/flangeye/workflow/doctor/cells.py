@@ -398,7 +398,7 @@ class CellPrediction:
 
     @property
     def size(self) -> float:
-        """Of the errors, in units of ordinary ones."""
+        """Size of the errors, in units of those of sound sightings."""
         # Errors of sound sightings, as a share of how far they are apart, and of their rotations
         # [rad]: so large that noise does not reach them, for a wrong unit, side or mounting gives
         # errors as large as the motion itself
@@ -430,7 +430,7 @@ def predicted(session: CellSession, search: bool = True) -> CellPrediction:
 
 
 def _possible(observations: Sequence[Observation]) -> bool:
-    """Whether everything is as near as things in a cell are."""
+    """Whether typical distances of targets and arms are those of a cell."""
     seen = np.array([np.linalg.norm(o.feature.centre) for o in observations])
     reach = [x.translation for o in observations for x in o.poses.values()]
     far = np.linalg.norm(reach, axis=1)
@@ -458,7 +458,7 @@ def _thinned(observations: Sequence[Observation]) -> list[Observation]:
 
 
 def _session(observations: Sequence[Observation]) -> RecordedSession:
-    """Return the sightings as the other checks' text counts them."""
+    """Return the sightings as the session that a finding counts its samples by."""
     n = len(observations)
     nothing = np.full((n, 3), np.nan)
     return RecordedSession(

@@ -309,11 +309,10 @@ def weld_result(weld: t.WeldReport | None, scan: t.WorkpieceScan | None) -> Weld
 
 
 def _weld_truth(weld: t.WeldReport, true_seams: list[t.Array]) -> WeldTruthResult | None:
-    """Compare with the true seam that is nearest, where the torch was between its ends.
+    """Return the torch's distance from the nearest true seam, between that seam's ends.
 
-    Not while the tip still feels for the groove, and not before the torch was near enough to the
-    seam to be lit: that of a weld that is gone on with comes back to the seam first, unlit. Passes
-    after the root's are beside the seam, as they were asked to be.
+    Left out are the search for the groove, the sweep, the way before the arc was struck (a resumed
+    weld first returns to the seam), and later passes, which run beside the seam on purpose.
     """
     torch = weld.true_torch if len(weld.true_torch) else weld.torch
     welds = ~np.isin(weld.phases, ("seeking", "probing", "entering", "returning", "passing"))

@@ -145,11 +145,11 @@ def beforehand(prior: ModelPrior, settings: Following) -> tuple[SweepFit, float]
 
 
 def along(plan: Path, prior: ModelPrior, settings: Following) -> float:
-    """Return how many standard deviations contain the torch's error along a whole plan.
+    """Return the coverage factor of the torch's error bound along a whole plan.
 
-    They do so as surely as ``sigmas`` of them at a single place. Torch and tip are at one length
-    of the tool from each other: the plan has about one independent error for each such length, and
-    one more (Bonferroni's inequality).
+    The bound then holds along the whole plan with the probability that ``sigmas`` standard
+    deviations have at a single place. Errors are independent over about one tool length, so a plan
+    has as many independent errors as tool lengths, and one more (Bonferroni's inequality).
     """
     places = 1.0 + plan.length / prior.distance
     return -float(ndtri(ndtr(-settings.sigmas) / places))

@@ -203,7 +203,7 @@ class Contact:
                 yield weighed.felt, climbs * (self._flat * weighed.climbed) ** 2
 
     def _part(self, s: float, fallen: float) -> None:
-        """Note whether the tip has fallen at a measurement, given the probability of it."""
+        """Update where the tip fell off the joint, given the probability that it has fallen."""
         if fallen < 0.5:
             self.fell, self._borne = None, (self._borne[1] if self._borne else s, s)
         elif self.fell is None and self._borne is not None:

@@ -207,8 +207,8 @@ class Welding:
     def _ahead(self) -> tuple[float, float]:
         """Return the least certain place on the rest of the plan, and the torch's bound there [m].
 
-        Where the tip has been, the seam is taken as it was felt, and ahead of it as surely as where
-        it was felt last. The control error is taken as twice what it is as a rule.
+        Where the tip has been, the seam's variance is the estimated one; ahead of the tip it is
+        that of the last settled place. The control error is assumed to be twice its usual size.
         """
         task, refined = self._task, self._seam.refined
         foreseen = predicted(

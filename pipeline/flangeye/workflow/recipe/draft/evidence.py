@@ -60,11 +60,11 @@ def poses_by_number(table: Table) -> tuple[list[PoseColumns], Headings]:
 
 
 def _is_index(numbers: Floats) -> bool:
-    """Return whether the first column counts the rows, or calls them by whole numbers.
+    """Return whether the first column is an index: whole numbers, all different.
 
-    With gaps it counts only before six numbers that are not a quaternion's: whole numbers before a
-    position and a quaternion may be times (TUM's trajectories). In no order it calls the rows,
-    where others are not whole.
+    Consecutive numbers always are one. Rising numbers with gaps are one only before six values,
+    because before a position and a quaternion they may be times (as in TUM's trajectories).
+    Unordered numbers are one if the other columns are not whole.
     """
     first, others = numbers[:, 0], numbers[:, 1:]
     whole = bool((first == np.round(first)).all())
@@ -77,7 +77,7 @@ def _is_index(numbers: Floats) -> bool:
 
 
 def _of_whole_row(numbers: Floats) -> bool:
-    """Return whether a row has no number before its poses; 7 are a quaternion's, or angles."""
+    """Return whether rows consist of poses alone, without an index or a time before them."""
     seven = numbers.shape[1] == 7 and _quaternion_at(numbers) is None
     return _shape(numbers) and not (seven and np.abs(numbers).max() > 360.0)
 
