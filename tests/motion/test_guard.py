@@ -19,7 +19,7 @@ from flangeye.devices import SILENT, DeviceError, RobotState
 from flangeye.errors import RunStopped
 from flangeye.motion import watchdog as guard_module
 from flangeye.motion.arm import GUARD, WatchedArm, _alarmed, run_number, watched
-from flangeye.motion.route import Router
+from flangeye.motion.route import Route, Router
 from flangeye.motion.supervision import RememberedState
 from flangeye.motion.watchdog import GuardConfig, Watchdog
 from tests.motion.stand_in import (
@@ -371,6 +371,7 @@ def test_a_signal_writes_to_the_alarm_and_what_was_there_before_comes_back() -> 
         with _alarmed(alarm):
             os.kill(os.getpid(), number)
             assert os.read(hears.fileno(), 1) == bytes([number])
+        assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)  # it beats no more
     finally:
         signal.signal(number, handler)
     assert signal.set_wakeup_fd(before) == before
@@ -471,22 +472,27 @@ def test_a_guard_that_was_held_or_hears_nothing_of_the_program_stops_for_good(wh
     assert "arrived" not in [r.what for r in wire.heard]
 
 
-def test_what_was_asked_before_a_guard_was_held_is_not_done_after_it() -> None:
+@pytest.mark.parametrize(("late", "done"), [(1.0, True), (1.001, False), (3.0, False)])
+def test_what_was_asked_before_a_guard_was_held_is_not_done_after_it(
+    late: float, done: bool
+) -> None:
     reading, writing = os.pipe()
     robot, now = StandIn(), [0.0]
     joints = robot.arm.stance.joints
     way = Router(MODEL, LIMITS, joints).route(joints, turned(joints, j1=0.8))
-    wire: Any = Wire(robot, [(0, ("close", None))])
+    wire: Any = Wire(robot, [(0, ("go", way)), (0, ("close", None))])
     guard = Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS, alarm=reading))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(time, "monotonic", lambda: now[0])
         guard._turned = guard._heard = 0.0
-        now[0] = 3.0
-        guard._command("go", way)
-    (report,) = [r for r in wire.heard if r.what == "fault"]
-    assert report.content.startswith("the guard was held for 3.00 s")
-    assert not guard._legs
+        now[0] = late
+        guard.run()
+    faults = [r.content for r in wire.heard if r.what == "fault"]
+    assert robot.commands()[:1] == (["move"] if done else ["stop"])
+    if not done:
+        assert faults[0].startswith(f"the guard was held for {late:.2f} s")
     os.close(writing)
+    os.close(reading)
 
 
 @pytest.mark.parametrize("what", ["guard", "program"])
@@ -502,3 +508,48 @@ def test_an_arm_at_rest_bears_a_longer_silence(what: str, seconds: float, faults
     assert [r.what for r in wire.heard if r.what != "state"] == ["opened", "arrived"] + faults * [
         "fault"
     ]
+
+
+def test_a_guard_has_precedence_over_who_leads_and_leaves_signals_to_the_alarm(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    handlers: dict[int, Any] = {}
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *given: asked.append(given))
+    monkeypatch.setattr(signal, "signal", lambda number, what: handlers.setdefault(number, what))
+    monkeypatch.setattr(guard_module, "guard", lambda wire, charge: asked.append(charge))
+    hears, alarm = multiprocessing.Pipe(duplex=False)
+    robot = StandIn()
+    with hears, alarm:
+        charge = GuardConfig(lambda: robot, MODEL, LIMITS)
+        guard_module.watchdog_process(alarm, charge, hears)
+        assert asked[1].alarm == hears.fileno()
+    (who, policy, how), _ = asked
+    assert (who, policy, how.sched_priority) == (0, os.SCHED_FIFO, 2)
+    assert handlers[signal.SIGINT] is handlers[signal.SIGTSTP] is signal.SIG_IGN
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        with pytest.raises(SystemExit):  # as an exception, which stops the arm
+            handlers[ending]()
+    del asked[:]
+    with guard_module.precedence(guard_module.LEADING):
+        ((who, policy, how),) = asked
+        assert (who, policy, how.sched_priority) == (0, os.SCHED_FIFO, 1)
+    who, policy, how = asked[1]
+    assert (who, policy, how.sched_priority) == (0, os.SCHED_OTHER, 0)
+
+
+def test_the_legs_of_a_way_are_driven_one_after_the_other() -> None:
+    robot = StandIn()
+    joints = robot.arm.stance.joints
+    router, middle, goal = Router(MODEL, LIMITS, joints), turned(joints, j1=0.1), joints
+    legs = [
+        leg
+        for way in (router.route(joints, middle), router.route(middle, goal))
+        if isinstance(way, Route)
+        for leg in way.legs
+    ]
+    wire: Any = Wire(robot, [(0, ("go", Route(tuple(legs)))), (3000, ("close", None))])
+    Watchdog(robot, wire, GuardConfig(lambda: robot, MODEL, LIMITS)).run()
+    assert [r.what for r in wire.heard if r.what != "state"] == ["opened", "arrived"]
+    assert robot.commands() == ["move", "move"]
+    assert robot.state().joints == pytest.approx(goal, abs=1e-3)

@@ -75,6 +75,21 @@ def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
         watch.judge(replace(state, joint_speeds=np.r_[-fast * 1.001, np.zeros(5)]))
 
 
+def test_the_bound_of_a_joint_s_speed_is_still_allowed() -> None:
+    watch = Supervisor(MODEL, LIMITS)
+    watch.led()
+    bound = 1.3 * LIMITS.joint_speed
+    assert not watch.judge(replace(moving(SECOND, 0.0), joint_speeds=np.r_[bound, np.zeros(5)]))
+
+
+def test_an_arm_that_is_found_moving_has_two_seconds_to_come_to_rest() -> None:
+    watch = Supervisor(MODEL, LIMITS)
+    assert not watch.judge(moving(5 * SECOND))
+    assert not watch.judge(moving(7 * SECOND))
+    with pytest.raises(SafetyFault, match="the arm moves without a command from here"):
+        watch.judge(moving(7 * SECOND + 1))
+
+
 @pytest.mark.parametrize("what", ["joints", "joint_speeds", "force"])
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_what_is_no_number_stops_an_arm_that_stands_or_moves(what: str, number: float) -> None:
@@ -182,6 +197,38 @@ def test_three_tenths_of_a_second_on_the_way_without_a_move_and_no_longer() -> N
     watch.set_off(Leg(GOAL, 0.1, 0.1, 4.0))
     watch.judge(at(1.7, GOAL))
     assert watch.judge(at(2.1, GOAL))
+
+
+def from_zero(goal: Any, seconds: float = 4.0) -> Supervisor:
+    """Return a watch on an arm that was sent from zero, where its angles are exact, to a goal."""
+    watch = Supervisor(MODEL, LIMITS)
+    watch.judge(replace(AT_HOME, joints=np.zeros(6)))
+    watch.set_off(Leg(np.array(goal), 0.1, 0.1, seconds))
+    return watch
+
+
+NEAR = float(np.radians(0.05))
+FAR = [0.0, 0.4, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_the_bounds_themselves_are_on_the_side_of_what_is_allowed() -> None:
+    beside = np.array([0.0, 0.0, float(np.radians(3.0)), 0.0, 0.0, 0.0])
+    from_zero(FAR).judge(at(0.5, beside, 0.1))
+    barely = [2 * NEAR, 0.0, 0.0, 0.0, 0.0, 0.0]
+    from_zero(barely).judge(at(1.5, np.zeros(6)))
+    with pytest.raises(SafetyFault, match="has not moved"):  # so far an arm trembles
+        from_zero(FAR).judge(at(1.001, np.array([0.0, NEAR, 0.0, 0.0, 0.0, 0.0])))
+
+
+def test_the_bound_itself_is_not_near_the_goal_and_a_bound_s_speed_is_rest() -> None:
+    watch, beside = from_zero(FAR), np.array([NEAR, 0.4, 0.0, 0.0, 0.0, 0.0])
+    for seconds in (3.0, 3.1, 3.3):
+        assert not watch.judge(at(seconds, beside))
+    with pytest.raises(SafetyFault, match="the arm ended its move 0.1 deg before the goal"):
+        watch.judge(at(3.301, beside))
+    watch = from_zero(FAR)
+    watch.judge(at(3.0, np.array(FAR), 1e-3))
+    assert watch.judge(at(3.1, np.array(FAR), 1e-3))
 
 
 def test_the_next_leg_begins_where_and_when_the_arm_is() -> None:

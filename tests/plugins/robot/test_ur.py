@@ -294,17 +294,6 @@ def test_ctrl_c_does_not_reach_the_client_process(controller: Any) -> None:
     assert words == "True\n"
 
 
-def test_samples_are_dated_by_the_least_delay_and_a_delay_that_stays_is_forgotten() -> None:
-    clock = worker.SampleClock()
-    ahead = 1000.0
-    dates = [clock.sampled(0.002 * i, ahead + 0.002 * i + 0.003 * (i % 5)) for i in range(500)]
-    np.testing.assert_allclose(dates, ahead + 0.002 * np.arange(500), atol=3e-4)
-    late = [clock.sampled(1.0 + 0.002 * i, ahead + 1.0 + 0.002 * i + 0.4) for i in range(15000)]
-    ages = ahead + 1.0 + 0.002 * np.arange(15000) + 0.4 - late
-    assert ages[0] > 0.39 and (ages[:7000] > 0.1).all()
-    assert ages[-1] < 0.001
-
-
 def test_a_program_that_is_not_let_run_for_a_while_still_reads_the_arm(
     robot: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
