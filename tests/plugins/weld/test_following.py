@@ -1,5 +1,8 @@
 """The torch stays in the seam; the controller alone, against the simulated groove."""
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,6 +59,26 @@ def test_both_ends_of_the_seam_are_felt_and_it_is_welded_between_them(
     assert abs(done.deviation()).max() < 0.3e-3
     assert done.torch_s.max() == pytest.approx(0.12, abs=2.5e-3)
     assert done.controller.arc_from + shift == pytest.approx(0.0, abs=1.5e-3)
+
+
+IMPORTED = """
+import sys
+from tests.plugins.weld.bench import World, make, straight
+from flangeye_plugins.weld.settings import Following
+plan, asked = straight(0.02), Following()
+world = World(plan, plan, make("tactile", plan, asked), asked)
+before = set(sys.modules)
+print(world.run().phase[-1], sorted(set(sys.modules) - before))
+"""
+
+
+def test_nothing_is_imported_while_the_arm_moves() -> None:
+    """A library may take a second for that, in which nothing leads the tip."""
+    root = Path(__file__).parents[3]
+    ended = subprocess.run(
+        [sys.executable, "-c", IMPORTED], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert ended.stdout == "done []\n"
 
 
 @pytest.mark.parametrize("degrees", [90, -90])
