@@ -193,6 +193,26 @@ def test_which_links_were_taken_is_said(kuka: Path) -> None:
     )
 
 
+def test_a_gripper_is_no_flange_but_what_its_fingers_stand_on(kuka: Path) -> None:
+    """The last link is taken; where the gripper has a base of its own, one of the two is asked."""
+
+    def finger(on: str, side: int) -> str:
+        return (
+            f'<link name="finger_{side}"/><joint name="slide_{side}" type="prismatic">'
+            f'<parent link="{on}"/><child link="finger_{side}"/><axis xyz="0 {side} 0"/>'
+            '<limit lower="0" upper="0.04" velocity="1"/><mimic joint="slide_1"/></joint>'
+        )
+
+    bare = kuka.read_text().replace(TOOL, "")
+    kuka.write_text(bare.replace("</robot>", f"{finger('link_6', 1)}{finger('link_6', 2)}</robot>"))
+    assert "flange 'link_6'" in robot_from_urdf(kuka).notes[0]
+    hand = TOOL.replace("tool0", "hand").replace('"flange"', '"palm"')
+    fingers = f"{hand}{finger('hand', 1)}{finger('hand', 2)}"
+    kuka.write_text(bare.replace("</robot>", f"{fingers}</robot>"))
+    with pytest.raises(RecipeError, match="write flange: link_6 or palm or hand$"):
+        robot_from_urdf(kuka)
+
+
 def test_a_flange_that_looks_aside_is_said_with_the_line_that_turns_it(kuka: Path) -> None:
     odd = robot_from_urdf(kuka, flange="flange").notes[1]
     assert isinstance(odd, Warn)

@@ -370,14 +370,37 @@ def _base(urdf: Urdf, asked: str | None, to_flange: list[ET.Element]) -> str:
 
 
 def flange_links(urdf: Urdf) -> list[str]:
-    """Return the link that is the flange by a name that makers use, or all ends of the arm."""
+    """Return the link that is the flange by a name that makers use, or those that may be it.
+
+    They are the ends of the arm, or the links that its gripper's fingers stand on.
+    """
     # Makers' names of the flange's frame, z outwards; the surest first
     for ending in ("tool0", "flange", "link8", "link_ee", "ee_link", "end_effector", "tool_frame"):
         named = [name for name in urdf.links if name.endswith(ending)]
         if len(named) == 1:
             return named
     parents = {end_of(joint, "parent") for joint in urdf.above.values()}
-    return [name for name in urdf.moved() if name not in parents]
+    ends = [name for name in urdf.moved() if name not in parents]
+    if not 1 < len(ends) <= NAMED:
+        return ends
+    chains = {end: urdf.chain(end) for end in ends}
+    return _before_fingers(chains) or ends
+
+
+def _before_fingers(chains: Mapping[str, list[ET.Element]]) -> list[str]:
+    """Return the links that a gripper's fingers stand on, and the fixed ends; empty without one."""
+    first, *others = chains.values()
+    shared = min(_shared(first, chain) for chain in others)
+    moving = {
+        end: sum(joint.get("type") in MOVES for joint in chain[shared:])
+        for end, chain in chains.items()
+    }
+    arm = [i for i, joint in enumerate(first[:shared]) if joint.get("type") in MOVES]
+    # Two arms on a torso move by more joints than it does, a gripper's fingers by fewer
+    if not 0 < max(moving.values()) < len(arm):
+        return []
+    fixed = [end for end, count in moving.items() if not count]
+    return [*(end_of(joint, "child") for joint in first[arm[-1] : shared]), *fixed]
 
 
 def _flange(urdf: Urdf, asked: str | None) -> str:
