@@ -483,6 +483,21 @@ TABLES_OF_POINTS = {
     "cm.csv": lambda f, p: f.write_text("x (cm),y (cm),z (cm)\n" + lines_of(1e2 * p, "{},{},{}")),
     "paraview.csv": lambda f, p: f.write_text(
         '"Points:0","Points:1","Points:2"\n' + lines_of(p, "{},{},{}")),
+    "words.csv": lambda f, p: f.write_text(
+        "px,py,Position X [mm],Position Y [mm],Position Z [mm]\n"
+        + lines_of(1e3 * p, "4,5,{},{},{}")),
+    "slash.csv": lambda f, p: f.write_text("X/mm;Y in mm;z.mm\n" + lines_of(1e3 * p, "{};{};{}")),
+    "long.csv": lambda f, p: f.write_text(
+        "x (millimeters),y (millimeters),z (millimeters)\n" + lines_of(1e3 * p, "{},{},{}")),
+    "below.csv": lambda f, p: f.write_text("X,Y,Z\nmm,mm,mm\n" + lines_of(1e3 * p, "{},{},{}")),
+    "preamble.csv": lambda f, p: f.write_text(
+        "Scanner ACME\nserial;123\nX [mm];Y [mm];Z [mm]\n" + lines_of(1e3 * p, "{};{};{}")),
+    "spaced.xyz": lambda f, p: f.write_text("# X [mm] Y [mm] Z [mm]\n" + lines_of(1e3 * p)),
+    "records_mm.npy": lambda f, p: np.save(
+        f, np.rec.fromarrays(1e3 * p.T, names="x_mm,y_mm,z_mm")),
+    "unit.npz": lambda f, p: np.savez(f, xyz_mm=1e3 * p, K=np.eye(3), pose=np.eye(4)),
+    "other.npz": lambda f, p: np.savez(f, pc=p, K=np.eye(3), pose=np.eye(4)),
+    "axes_first.npz": lambda f, p: np.savez(f, points=p.T),
     "ended.csv": lambda f, p: f.write_text(lines_of(p, "{},{},{},")),
 }  # fmt: skip
 
@@ -519,6 +534,8 @@ MISSING: dict[str, tuple[list[float | None], str]] = {
     "zeros": ([0, 0, 0], "(0, 0, 0)"),
     "a number of no place": ([-10000, -10000, -10000], "(-10000, -10000, -10000)"),
     "a far depth": ([None, None, 65535], "a depth of 65535"),
+    "no depth": ([None, None, 0], "a depth of 0"),
+    "a depth behind the scanner": ([None, None, -1], "a depth of -1"),
 }
 
 

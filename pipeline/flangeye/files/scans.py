@@ -159,13 +159,14 @@ def _holds_points(path: Path) -> bool:
         if path.suffix.lower() == ".npz":
             return math.prod(open_npz(path).shape) > 100
         table = open_text(path)
-        rotation = re.search(r"\b(qx|rx|roll|yaw)", read_head(path)[:500].decode("latin-1").lower())
+        head = read_head(path)[:500].decode("latin-1").lower()
     except StageError:
         return False
-    # x, y, z; intensity; a normal or a colour. Seven are a pose, and eight with its time
-    return (
-        not rotation and len(table.shape) == 1 and table.shape[0] > 100 and table.width in (3, 4, 6)
-    )
+    rotation = re.search(r"\b(qx|rx|roll|yaw)", head)
+    coloured = re.search(r"\b(r\W+g\W+b|red|nx|normal|intensity)\b", head)
+    # x, y, z; intensity; a normal or a colour. Seven without names are a pose, and eight with time
+    sized = table.width in (3, 4, 6) or coloured
+    return bool(not rotation and len(table.shape) == 1 and table.shape[0] > 100 and sized)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ def mark_missing(xyz: Points) -> str:
     """Set the values by which scanners mark missing points to NaN, in place.
 
     A repeated point is missing if it is the scanner's origin, or farther than all others. Points of
-    one depth are missing if that depth is more than three times all others.
+    one depth are missing if that depth is more than three times all others, or if it is zero or
+    less and all others are on one side.
 
     Args:
         xyz: (N, 3) in the file's own unit.
@@ -48,7 +49,7 @@ def mark_missing(xyz: Points) -> str:
     repeated = (alike == point).all(axis=1).mean() > 0.5
     if repeated and (not point.any() or _beyond(np.abs(point).max(), np.abs(others), 1.0)):
         gone, called = (xyz == point).all(axis=1), f"({', '.join(f'{x:g}' for x in point)})"
-    elif _beyond(abs(depth), np.abs(others[:, 2]), 3.0):
+    elif _beyond(abs(depth), np.abs(others[:, 2]), 3.0) or _not_among(depth, others[:, 2]):
         gone, called = xyz[:, 2] == depth, f"a depth of {depth:g}"
     else:
         return ""
@@ -58,6 +59,12 @@ def mark_missing(xyz: Points) -> str:
 
 def _beyond(value: float, others: Points, times: float) -> bool:
     return bool(others.size) and value > times * float(others.max())
+
+
+def _not_among(depth: float, others: Points) -> bool:
+    """Return whether all others are ahead of the scanner, and the depth is its own or behind it."""
+    ahead = np.sign(others[:1])
+    return bool(others.size) and bool((others * ahead > 0).all() and depth * ahead <= 0)
 
 
 LengthUnit = Literal["m", "mm", "cm", "in"]

@@ -6,6 +6,7 @@ import io
 import math
 import re
 from codecs import BOM_UTF8
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -36,7 +37,10 @@ HEADER_ERRORS = (ValueError, TypeError, SyntaxError, TokenError)
 
 NUMBERS = "fiu"
 """Codes of NumPy's numeric types: floating, signed and unsigned."""
-STATED = {"mm": 1e3, "cm": 1e2, "um": 1e6, "m": 1.0, "inch": 1 / 0.0254, "in": 1 / 0.0254}
+STATED = {
+    "mm": 1e3, "millimeter": 1e3, "millimetre": 1e3, "cm": 1e2, "um": 1e6, "m": 1.0, "meter": 1.0,
+    "metre": 1.0, "inch": 1 / 0.0254, "in": 1 / 0.0254,
+}  # fmt: skip
 """Number of each unit in a metre, for the units that a heading may state."""
 WIDEST = 16
 """Most numbers of one point: x, y, z, then normals, colours, intensity."""
@@ -53,11 +57,10 @@ def open_npy(path: Path) -> PointTable:
     """
     shape, fields = _npy_header(path, records=True)
     if fields:
-        axes_of(path, fields)
-        return NpyTable(path, shape, tuple(fields))
+        return NpyTable(path, shape, fields, unit=_named_axes(path, fields)[1])
     if _is_wide(shape):
         return NpyTable(path, shape[:-1])
-    if len(shape) in (2, 3) and 3 <= shape[0] <= WIDEST < shape[-1]:
+    if _is_axes_first(shape):
         return NpyTable(path, shape[1:], axes_first=True)
     refuse(path, f"has shape {shape}; a point cloud is (N, 3), (H, W, 3), (3, N) or (3, H, W)")
 
@@ -72,19 +75,38 @@ def open_npz(path: Path) -> LoadedTable:
         StageError: The archive has no such array, or several without a usual name.
     """
     read_head(path)
-    arrays = {name.lower(): array for name, array in load_npz(path).items()}
-    apart = [arrays[axis] for axis in "xyz" if axis in arrays]
-    if len(apart) == 3 and len({array.shape for array in apart}) == 1:
-        return LoadedTable(path, apart[0].shape, np.stack([array.ravel() for array in apart], -1))
+    arrays = {_axis(name): array for name, array in load_npz(path).items()}
+    by_name = {name: (array, unit) for (name, unit), array in arrays.items()}
+    apart = [by_name[axis] for axis in "xyz" if axis in by_name]
+    if len(apart) == 3 and len({array.shape for array, _ in apart}) == 1:
+        flat = np.stack([array.ravel() for array, _ in apart], -1)
+        return LoadedTable(path, apart[0][0].shape, flat, apart[0][1])
     called = ("points", "xyz", "pts", "cloud", "pointcloud", "point_cloud", "pcd", "vertices")
-    named = [n for n in called if n in arrays and _is_wide(arrays[n].shape)]
-    likely = named[:1] or [name for name, array in arrays.items() if _may_be_points(array.shape)]
+    fitting = {name: found for name, (array, unit) in by_name.items()
+               if (found := _axes_last(array)) is not None}  # fmt: skip
+    named = [name for name in called if name in fitting]
+    likely = named[:1] or [name for name, array in fitting.items() if _may_be_points(array.shape)]
     if len(likely) != 1:
-        held = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        held = ", ".join(f"{name} {array.shape}" for name, (array, _) in by_name.items())
         refuse(path, f"it is not clear which of its arrays holds the points: {held or 'none'}; "
                      "call one points, (N, 3) or (H, W, 3)")  # fmt: skip
-    array = arrays[likely[0]]
-    return LoadedTable(path, array.shape[:-1], array.reshape(-1, array.shape[-1])[:, :3])
+    array, unit = fitting[likely[0]], by_name[likely[0]][1]
+    return LoadedTable(path, array.shape[:-1], array.reshape(-1, array.shape[-1])[:, :3], unit)
+
+
+def _axes_last(array: NDArray[Any]) -> NDArray[Any] | None:
+    """Return an array with x, y and z as its last index; None if it has no such index."""
+    return (
+        array
+        if _is_wide(array.shape)
+        else np.moveaxis(array, 0, -1)
+        if _is_axes_first(array.shape)
+        else None
+    )
+
+
+def _is_axes_first(shape: Shape) -> bool:
+    return len(shape) in (2, 3) and 3 <= shape[0] <= WIDEST < shape[-1]
 
 
 def _is_wide(shape: Shape) -> bool:
@@ -92,8 +114,9 @@ def _is_wide(shape: Shape) -> bool:
 
 
 def _may_be_points(shape: Shape) -> bool:
-    """Return whether an array of unknown name may be points, and not poses (N, 4, 4)."""
-    return (len(shape) == 2 or (len(shape) == 3 and shape[1] > 4)) and shape[-1] in (3, 4, 6)
+    """Return whether an array of unknown name may be points, and not poses or a camera's matrix."""
+    rows = math.prod(shape[:-1]) > WIDEST and (len(shape) == 2 or shape[1] > 4)
+    return rows and shape[-1] in (3, 4, 6)
 
 
 def npy_shape(path: Path) -> Shape:
@@ -223,17 +246,19 @@ class NpyTable(PointTable):
     Attributes:
         fields: Names of a record's fields; empty for plain numbers.
         axes_first: Whether x, y and z are the first index and not the last.
+        unit: Unit of the coordinates, where the fields' names state it; else empty.
     """
 
     fields: tuple[str, ...] = ()
     axes_first: bool = False
+    unit: str = ""
 
     def decode(self) -> Points:
         """Return the points of the array."""
         with np.errstate(over="ignore"):
             array = np.load(self.path, allow_pickle=False)
             if self.fields:
-                named = [self.fields[i] for i in axes_of(self.path, self.fields)]
+                named = [self.fields[i] for i in _named_axes(self.path, self.fields)[0]]
                 return np.stack([array[name].ravel() for name in named], -1).astype(np.float32)
             array = np.moveaxis(array, 0, -1) if self.axes_first else array
             xyz: Points = array.reshape(-1, array.shape[-1])[:, :3].astype(np.float32)
@@ -246,9 +271,11 @@ class LoadedTable(PointTable):
 
     Attributes:
         xyz: (N, 3).
+        unit: Unit of the coordinates, where the arrays' names state it; else empty.
     """
 
     xyz: NDArray[Any]
+    unit: str = ""
 
     def decode(self) -> Points:
         """Return the points in single precision."""
@@ -262,7 +289,8 @@ def open_text(path: Path) -> TextTable:
     Values are separated by blanks, tabs, commas or semicolons; unless commas separate values, they
     may be decimal commas. Lines that begin with ``#``, ``//`` or ``%`` are remarks; the last one
     above the points may be the heading. A first row with one whole number is the count of points
-    (``.pts``). The heading may state the unit: ``x_mm`` or ``X [mm]``.
+    (``.pts``). The heading may state the unit: ``x_mm`` or ``X [mm]``, or a row of units below it;
+    what stands above the heading is skipped.
 
     Raises:
         StageError: The first row is neither a heading nor three or more numbers.
@@ -281,39 +309,82 @@ def open_text(path: Path) -> TextTable:
             skipped = 2
         elif rows - 1 != count:
             refuse(path, f"its first row promises {count} points, but it has {rows - 1}")
+    skipped += _rows_above_heading(lines[skipped:])
     cells, delimiter, comma = _cells(lines[skipped])
     heading = _heading(cells)
     if heading:
         skipped += 1
         comma = delimiter == ";" and "," in "".join(lines[skipped : skipped + 1])
+        if lines[skipped:] and (below := _units_in(_cells(lines[skipped])[0])):
+            heading = [(name, unit) for (name, _), unit in zip(heading, below, strict=False)]
+            skipped += 1
     elif len(cells) < 3:
         refuse(path, f"its first row has {len(cells)} values; a point has 3 or more")
     else:
         heading = _heading(_cells(above)[0])
-        known = len(heading) == len(cells) and {"x", "y", "z"} <= {n.lower() for n, _ in heading}
+        known = len(heading) == len(cells) and _has_axes(heading)
         heading = heading if known else []
     axes = axes_of(path, [name for name, _ in heading]) if heading else (0, 1, 2)
-    units = {heading[axis][1] for axis in axes if heading} - {""}
-    if len(units) > 1:
-        refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
     return TextTable(
         path, (rows - skipped,), offset, len(cells), axes, skipped, rows, delimiter,
-        unit=next(iter(units), ""), comma=comma, remarks=remarks,
+        unit=_one_unit(path, [heading[axis][1] for axis in axes if heading]), comma=comma,
+        remarks=remarks,
     )  # fmt: skip
 
 
-def _heading(cells: list[str]) -> list[tuple[str, str]]:
+Heading = list[tuple[str, str]]
+"""Name and unit of each column; the unit is empty where none is stated."""
+
+
+def _one_unit(path: Path, stated: Iterable[str]) -> str:
+    """Return the unit that a heading states; empty if it states none, refused if several."""
+    units = set(stated) - {""}
+    if len(units) > 1:
+        refuse(path, f"its heading states several units: {', '.join(sorted(units))}")
+    return next(iter(units), "")
+
+
+def _named_axes(path: Path, names: Sequence[str]) -> tuple[tuple[int, int, int], str]:
+    """Return the indices of x, y and z among names, and the unit that the names state."""
+    heading = _heading(list(names))
+    axes = axes_of(path, [name for name, _ in heading])
+    return axes, _one_unit(path, [heading[axis][1] for axis in axes])
+
+
+def _has_axes(heading: Heading) -> bool:
+    return {"x", "y", "z"} <= {name for name, _ in heading}
+
+
+def _rows_above_heading(lines: Sequence[str]) -> int:
+    """Return how many rows stand above the first heading with x, y and z; 0 if none has them."""
+    first = _cells(lines[0])[0]
+    if not first or _is_number(first[0]):
+        return 0
+    found = (i for i, line in enumerate(lines) if _has_axes(_heading(_cells(line)[0])))
+    return next(found, 0)
+
+
+def _units_in(cells: Sequence[str]) -> list[str]:
+    """Return the units that a row's cells name; empty if one of them names none."""
+    units = [cell.strip("[]() ").lower() for cell in cells]
+    return units if all(unit in STATED for unit in units) else []
+
+
+def _heading(cells: Sequence[str]) -> Heading:
     """Return the name and the unit of each cell; nothing where all are numbers or empty."""
-    return (
-        []
-        if all(not cell or _is_number(cell) for cell in cells)
-        else [_axis(cell) for cell in cells]
-    )
+    if all(not cell or _is_number(cell) for cell in cells):
+        return []
+    heading = [_axis(cell) for cell in cells]
+    for axis in "xyz":  # beside another x, px is a pixel's
+        alike = [i for i, (name, _) in enumerate(heading) if name == axis]
+        for i in sorted(alike, key=lambda i: (f"p{axis}" in cells[i].lower(), len(cells[i])))[1:]:
+            heading[i] = cells[i].lower(), ""
+    return heading
 
 
 def _cells(line: str) -> tuple[list[str], str | None, bool]:
     """Return the values of a row, their separator, and whether it has decimal commas."""
-    row = line.lstrip("#/% ").strip()
+    row = re.sub(r"\s+(?=[\[(])", "", line.lstrip("#/% ").strip())  # ``X [mm]`` is one cell
     delimiter = next((mark for mark in ";\t," if mark in row), None)
     comma = (delimiter != "," and "," in row) or (delimiter == "," and _has_decimal_commas(row))
     delimiter = None if comma and delimiter in (",", "\t") else delimiter
@@ -322,13 +393,23 @@ def _cells(line: str) -> tuple[list[str], str | None, bool]:
 
 
 def _axis(cell: str) -> tuple[str, str]:
-    """Return the name and the unit of a heading's cell: ``x_mm``, ``X [mm]``, ``Points:0``."""
-    cell = cell.strip('"')
-    if numbered := re.fullmatch(r"[^:]+:([012])", cell):  # ParaView's
-        return "xyz"[int(numbered[1])], ""
-    unit = "|".join(STATED)
-    match = re.fullmatch(rf"([a-z]\w*?)[\s_]*[\[(]?({unit})?[\])]?", cell, re.IGNORECASE)
-    return (match[1], (match[2] or "").lower()) if match else (cell, "")
+    """Return name and unit of a heading's cell: ``x_mm``, ``Position X [mm]``, ``Points:0``.
+
+    The name is that of an axis, or the cell in small letters.
+    """
+    words = re.findall(r"[^\W\d_]+|\d", cell.lower().replace("\u00b5m", "um"))
+    if words and (joined := re.fullmatch(rf"([xyz])({'|'.join(STATED)})", words[0])):
+        words[:1] = joined.groups()
+    units = [word.removesuffix("s") for word in words[1:] if word.removesuffix("s") in STATED]
+    rest = [word for word in words if word.removesuffix("s") not in STATED]
+    fillers = ("pos", "position", "point", "points", "coord", "coordinate", "koordinate")
+    known = [word for word in rest if word not in fillers]
+    by_word = {**dict(zip("xyz", "xyz", strict=True)), "px": "x", "py": "y", "pz": "z"}
+    if len(known) < len(rest):  # ParaView's ``Points:0``
+        by_word |= {"0": "x", "1": "y", "2": "z"}
+    name = by_word.get(known[0]) if len(known) == 1 else None
+    others = re.sub(rf"[\s_]*[\[(]?({'|'.join(STATED)})[\])]?$", "", cell.lower().strip('"'))
+    return name or others or cell.lower(), units[-1] if units else ""
 
 
 def _has_decimal_commas(row: str) -> bool:
