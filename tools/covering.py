@@ -1,8 +1,8 @@
-"""Record which test runs which line: python -m tools.covering SOURCE OUT TESTS
+"""Record which test runs which line: python -m tools.covering SOURCE OUT TESTS…
 
-The fast tests of a file (or, without any, those in real time) run once under coverage.py, each in
-its own context. OUT (JSON) gets the processor time of every passing test, and for each file and
-line the tests that run it.
+The fast tests of each file (or, without any, those in real time) run once under coverage.py, each in
+its own context. OUT (JSON) gets, for each file of tests, the processor time of every passing test,
+and for each file and line of the source the tests that run it.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,30 +46,39 @@ class Covering:
         if not report.passed:
             self._failed.add(report.nodeid)
 
-    def lines(self) -> dict[str, dict[int, list[str]]]:
-        """Return file -> line -> the passing tests that run it."""
+    def gathered(self, files: Collection[str]) -> dict[str, Any]:
+        """Return, for each file of tests, its passing tests' times and the lines that they run."""
         self._coverage.stop()
         data = self._coverage.get_data()
         for test in self._failed:
             self.seconds.pop(test, None)
-        found: dict[str, dict[int, list[str]]] = defaultdict(dict)
+        found: dict[str, Any] = {file: {"seconds": {}, "lines": {}} for file in files}
+        for test, seconds in self.seconds.items():
+            found[_file_of(test)]["seconds"][test] = seconds
         for file in data.measured_files():
+            source = str(Path(file).relative_to(Path.cwd()))
             for line, tests in data.contexts_by_lineno(file).items():
-                found[str(Path(file).relative_to(Path.cwd()))][line] = [
-                    test for test in tests if test in self.seconds
-                ]
+                for test in tests:  # what ran at import is no test's
+                    lines = found[_file_of(test)]["lines"] if test in self.seconds else {}
+                    lines.setdefault(source, {}).setdefault(line, []).append(test)
+                for of_file in found.values():
+                    of_file["lines"].setdefault(source, {})
         return found
+
+
+def _file_of(test: str) -> str:
+    return test.partition("::")[0]
 
 
 def main() -> Any:
     """Run the tests and write what ran what."""
-    source, out, tests = sys.argv[1:]
+    source, out, *tests = sys.argv[1:]
     plugin = Covering(Path(source))
-    code = pytest.main([*NAMED[:-1], "not slow and not realtime", tests], plugins=[plugin])
-    if code == pytest.ExitCode.NO_TESTS_COLLECTED:
-        code = pytest.main([*NAMED, tests], plugins=[plugin])
-    lines = plugin.lines()
-    Path(out).write_text(json.dumps({"seconds": plugin.seconds, "lines": lines}), "utf-8")
+    code = pytest.main([*NAMED[:-1], "not slow and not realtime", *tests], plugins=[plugin])
+    fast = {_file_of(test) for test in plugin.seconds}
+    if others := [file for file in tests if file not in fast]:
+        code = max(code, pytest.main([*NAMED, *others], plugins=[plugin]))
+    Path(out).write_text(json.dumps(plugin.gathered(tests)), "utf-8")
     return code
 
 

@@ -3,10 +3,10 @@
 python -m tools.mutate [SAMPLE] [--seed N] [--room NAME …] [--only FILE:LINE] [--tests FILE …]: a
 sample over the rooms below, each in a copy of the repository, under those fast tests of its room
 (or those named; of a file that has none, those in real time, one at a time) that run the changed
-line (coverage.py says which, once for each file of tests: build/mutation), the file's own first,
-then the fastest: in a fork of a process that has them collected (tools/trying.py), and if it lives
-there, in a new process. A change that fails no test is a survivor: its place and what was changed
-are printed, and the share that was killed.
+line (coverage.py says which, and is asked anew for a file of tests that has changed, into
+build/mutation), the file's own first, then the fastest: in a fork of a process that has them
+collected (tools/trying.py), and if it lives there, in a new process. A change that fails no test is
+a survivor: its place and what was changed are printed, and the share that was killed.
 """
 
 from __future__ import annotations
@@ -201,17 +201,20 @@ class Copy:
         """Return a room's fast tests; earlier results for a file are reused."""
         found, (source, *places) = Tests(), ROOMS[room]
         KEPT.mkdir(parents=True, exist_ok=True)
-        for file in (file for place in places for file in _test_files(ROOT / place)):
-            kept = KEPT / f"{room}-{file.stem}-{_digest(file)}.json"
-            if not kept.exists():
-                print(f"{room}: looking which lines {file.name} runs", file=sys.stderr)
-                found_now = self._root / "covering.json"
-                words = ["-m", "tools.covering", source, str(found_now)]
-                self._run([*words, str(file.relative_to(ROOT))])
-                gathered = json.loads(found_now.read_text("utf-8"))
+        files = [file for place in places for file in _test_files(ROOT / place)]
+        kept = {
+            str(file.relative_to(ROOT)): KEPT / f"{room}-{file.stem}-{_digest(file)}.json"
+            for file in files
+        }
+        if new := [file for file, place in kept.items() if not place.exists()]:
+            print(f"{room}: looking which lines {len(new)} files of tests run", file=sys.stderr)
+            found_now = self._root / "covering.json"  # in one process, which imports once
+            self._run(["-m", "tools.covering", source, str(found_now), *new])
+            for file, gathered in json.loads(found_now.read_text("utf-8")).items():
                 gathered["sources"] = {name: _digest(ROOT / name) for name in gathered["lines"]}
-                kept.write_text(json.dumps(gathered), "utf-8")
-            found.add(json.loads(kept.read_text("utf-8")))
+                kept[file].write_text(json.dumps(gathered), "utf-8")
+        for place in kept.values():
+            found.add(json.loads(place.read_text("utf-8")))
         return found
 
     def collect(self, room: str) -> None:

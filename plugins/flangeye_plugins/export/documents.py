@@ -44,6 +44,8 @@ def ros2_command(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
     command = ("ros2", "run", "tf2_ros", "static_transform_publisher")
     lines = [shlex.join([*command, *_arguments(each, params)]) for each in pose.each]
     text = pose.comment("#") + " &\n".join(lines) + "\n"
+    if "\0" in text or not text.isascii():
+        raise StageError("export.ros2_command: a name cannot be written as a word of a shell")
     return ExportedFile(f"{params.name}.ros2.sh", text, "run it in a shell that knows ROS 2")
 
 
@@ -227,7 +229,7 @@ def urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
     text = ElementTree.tostring(robot, "unicode")
     try:
         ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:  # a control character, which XML cannot hold
+    except (ElementTree.ParseError, UnicodeError) as error:  # a character that XML cannot hold
         raise StageError(f"export.urdf: a name cannot be written as XML: {error}") from None
     file = f'<?xml version="1.0"?>\n{text}\n'
     return ExportedFile(f"{params.name}.urdf", file, "copy the joints, or include the file")
