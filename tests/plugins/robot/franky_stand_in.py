@@ -85,6 +85,6 @@ class StandIn:
             twist = motion.target.end_effector_twist
             numbers = np.concatenate([twist.linear, twist.angular])
             a = motion.relative_dynamics_factor.acceleration * ACCELERATION
-            self._mover.go_on(numbers, a, 0.1)
+            self._mover.go_on(numbers, a, motion.duration.to_sec())
         else:
             self._mover.halt(2.0, in_space=not isinstance(motion, franky.JointStopMotion))

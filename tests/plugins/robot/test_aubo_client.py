@@ -199,6 +199,13 @@ def test_a_ride_slows_down_with_half_of_its_deceleration_and_comes_to_rest(clock
     assert ridden.ride.over
 
 
+def test_an_arm_that_creeps_is_stopped_before_it_is_sent_to_its_goal(clock: Clock) -> None:
+    ridden = Ridden(clock)
+    assert ridden.look(1.0, after=1e-4) == pytest.approx([2e-4, -1e-4])
+    assert ridden.look(0.001, after=1e-4) == "stop"
+    assert ridden.look(0.001) == "arrive"
+
+
 @pytest.mark.parametrize(("silent", "over"), [(0.149, False), (0.151, True)])
 def test_a_ride_that_nobody_looked_at_is_over(clock: Clock, silent: float, over: bool) -> None:
     ridden = Ridden(clock)

@@ -238,6 +238,27 @@ def test_a_pose_without_an_explanation_is_only_described() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("metres", "said"),
+    [
+        (0.0019, "that is 1.9 mm from the middle of the base"),
+        (0.0021, None),
+        (0.439, None),
+        (0.441, "that is 0.441 m from the base, and the arm is 0.40 m long"),
+    ],
+)
+def test_a_pose_in_the_base_or_beyond_the_arm_is_doubted(metres: float, said: str | None) -> None:
+    words = CONVENTIONS["quaternion_xyzw"]
+    pose = rigid(TILTED[:3, :3], metres * np.array([2.0, -1.0, 2.0]) / 3.0)
+    found = fault(words.numbers(pose), words, 0.4, None, Tolerance(0.02, 0.1))
+    assert (found and found.partition(":")[0]) == said
+
+
+def test_an_arm_moved_by_hand_is_looked_at_twenty_times_a_second(person: Person) -> None:
+    person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
+    assert person.robot().period == 0.05
+
+
 def test_piped_standard_input_works() -> None:
     code = (
         "from flangeye.models.loading import load_model\n"

@@ -247,6 +247,26 @@ def test_a_motion_that_was_not_renewed_in_time_is_not_resumed(
             assert len(graph.published) == 1
 
 
+def test_the_bound_of_silence_itself_is_borne(graph: Graph) -> None:
+    """Where the clock's numbers are exact: 0.3 - 0.15 is 0.15."""
+    graph.now = 0.0
+    with opened() as arm:
+        for stop in (True, False):
+            graph.now = 0.148
+            arm.wait_cycle()
+            graph.now = 0.15
+            arm.move_joints(graph.joints + 0.5, 0.5, 1.0)
+            count = len(graph.published)
+            graph.now = 0.3 if stop else 0.298
+            if stop:
+                arm.stop()
+            else:
+                arm.wait_cycle()
+                assert graph.now == 0.3
+            assert len(graph.published) == count + 1
+            arm.stop()
+
+
 def test_pieces_follow_one_another_and_begin_a_quarter_of_a_second_ago(graph: Graph) -> None:
     with opened() as arm:
         arm.move_joints(graph.joints + 0.5, 0.5, 1.0)
