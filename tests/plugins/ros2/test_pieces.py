@@ -154,7 +154,7 @@ def test_a_motion_is_as_fast_as_its_arm_and_no_faster_than_planned(
     speed = np.diff(far) / TICK / 0.5
     # It judges after three tenths of a second: an arm lags at the start.
     assert speed[7:14] == pytest.approx(1.0, abs=1e-6)
-    assert (speed[16] < 0.9) is (pace < 1.0)
+    assert bool(speed[16] < 0.9) is (pace < 1.0)
     assert speed[-20:] == pytest.approx(pace, abs=0.02)
     assert speed.max() <= 1.0 + 1e-6
 
