@@ -27,6 +27,7 @@ There the second arm's pose is ``second:``, with a position and a rotation of it
 from __future__ import annotations
 
 import csv
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -110,7 +111,7 @@ def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> Le
 
 
 def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
-    cloud, image = (None if name is None else root / name for name in (row.cloud, row.image))
+    cloud, image = (None if name is None else _scan(root, name) for name in (row.cloud, row.image))
     if cloud and cloud.suffix.lower() in IMAGES and not is_cloud(cloud):
         cloud, image = None, image or cloud
     name = row.id or (cloud or image or root).stem
@@ -122,6 +123,14 @@ def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Record
     return Recording(
         name, poses, cloud, joints=joints, role=row.role, time_ns=row.time_ns, image=image
     )
+
+
+def _scan(root: Path, name: str) -> Path:
+    """Return the path of a scan beside the poses, or in the only folder there that has it."""
+    if os.path.exists(root / name):  # noqa: PTH110  Path.exists raises for too long a name
+        return root / name
+    inside = [f / name for f in root.glob("*/") if os.path.isfile(f / name)]  # noqa: PTH113
+    return inside[0] if len(inside) == 1 else root / name
 
 
 def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:

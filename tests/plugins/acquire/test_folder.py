@@ -143,6 +143,16 @@ def test_a_heading_alone_is_an_archive_without_poses(tmp_path: Path) -> None:
     assert str(error.value) == f"{tmp_path}: holds no poses"
 
 
+def test_scans_stand_in_the_only_folder_that_has_their_name(tmp_path: Path) -> None:
+    (tmp_path / "poses.csv").write_text("image,x_m,y_m,z_m,qx,qy,qz,qw\n7.png,0,0,1,0,0,0,1\n")
+    for name in ("rgb", "others"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "rgb" / "7.png").touch()
+    assert read(tmp_path).recordings[0].image == tmp_path / "rgb" / "7.png"
+    (tmp_path / "others" / "7.png").touch()
+    assert read(tmp_path).recordings[0].image == tmp_path / "7.png"  # which is not there
+
+
 def test_a_folder_of_an_endless_name_is_refused(tmp_path: Path) -> None:
     said = refused(tmp_path, HEADING + ROW.replace("a.pcd", "a" * 256 + "/b.pcd"))
     assert said.startswith(f"{tmp_path}/aaa")
