@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
+from flangeye.files.clouds.plain import load_npy
 from flangeye.files.documents import KINDS, document_of
 from flangeye.files.regular import read_text
 from flangeye.types import Floats
@@ -110,6 +111,9 @@ def camera_in(path: Path) -> CameraFile | None:
 
 def _document(path: Path) -> Any:
     """Return a file's content: mappings, a bare matrix, or COLMAP's camera; None for others."""
+    if path.suffix.lower() == ".npy":
+        array = load_npy(path)
+        return array.astype(np.float64).reshape(3, 3) if array.size == 9 else None
     if path.suffix.lower() not in LABELLED:
         document = document_of(path)
         return None if document is None else document.data
@@ -144,13 +148,19 @@ def _with_lens_beside(camera: CameraFile) -> CameraFile:
     if len(beside) != 1:
         return camera
     try:
-        document = document_of(beside[0])
-        data = read_text(beside[0]).replace(",", " ").split() if document is None else document.data
+        lens = _numbers(_bare(beside[0]))
     except StageError:
         return camera
-    lens = _numbers(data)
     fits = len(lens) >= 4 and _checked(beside[0], camera.matrix, lens) is not None
     return camera._replace(distortion=lens, lens_of=beside[0].name) if fits else camera
+
+
+def _bare(path: Path) -> Any:
+    """Return the numbers of a file that holds nothing else."""
+    if path.suffix.lower() == ".npy":
+        return load_npy(path)
+    document = document_of(path)
+    return read_text(path).replace(",", " ").split() if document is None else document.data
 
 
 def _mappings(data: Any) -> Iterator[dict[str, Any]]:

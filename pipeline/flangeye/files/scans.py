@@ -13,7 +13,7 @@ from pathlib import Path
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import CONVERSIONS, VENDOR
-from flangeye.files.clouds.plain import open_npz, open_text
+from flangeye.files.clouds.plain import npy_shape, open_npz, open_text
 from flangeye.files.clouds.table import read_head
 from flangeye.files.images import is_depth_image
 from flangeye.files.recording import Recording
@@ -133,11 +133,22 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
     """
     files = sorted(folder.glob(f"{stem}.*"), key=lambda p: (natural(p.stem), p.suffix))
     points = texts_of_points(files)
-    found = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES) or p in points]
+    known = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES) or p in points]
+    found = [p for p in known if not is_matrix(p)]
     foreign = [p for p in files if p.suffix.lower() in VENDOR]
     if foreign and not found:
         raise StageError(f"{foreign[0]}: {CONVERSIONS[foreign[0].suffix.lower()]}")
     return found
+
+
+def is_matrix(path: Path) -> bool:
+    """Return whether a file is an array of no more numbers than a pose or a camera has."""
+    if path.suffix.lower() != ".npy":
+        return False
+    try:
+        return math.prod(npy_shape(path)) <= 16
+    except StageError:
+        return False
 
 
 def texts_of_points(files: Iterable[Path]) -> set[Path]:
