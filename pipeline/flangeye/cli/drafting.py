@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from flangeye.plugin.registry import Registry
     from flangeye.types import Observation
     from flangeye.workflow.recipe.draft import Draft, Questions
+    from flangeye.workflow.recipe.draft.survey import FolderSurvey
 
 ANSWERS = {
     "robot": "Robot model, its .urdf or .yaml file, or none.",
@@ -123,12 +124,13 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     survey, given = look(folder), dict(questions.given)
     for line in survey.lines():
         say(line)
-    draft = draft_recipe(survey, out, questions, registry)
+    draft = _drafted(survey, out, questions, registry)
+    turned = {name: found for name, found in questions.likely.items() if name == "rotation"}
     if "acquire.images" in draft.text and given["camera"] is None and questions.prompt is None:
         mounting = mounting_seen(_seen(draft, survey.folder, out, registry, 12) or ())
         if mounting is None:
             return draft
-        questions.given, questions.likely = given, {"camera": mounting}
+        questions.given, questions.likely = given, {**turned, "camera": mounting}
         questions.assumed.clear()
         return draft_recipe(survey, out, questions, registry)
     if "fit.rim" not in draft.text or _seen(draft, survey.folder, out, registry, 1) != []:
@@ -140,6 +142,33 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     seen = "what is seen instead, 'body: gripper.stl' for a tool by its mesh"
     questions.ask("target", f"no scan shows the flange; {seen}", "flange")
     return draft_recipe(survey, out, questions, registry)
+
+
+def _drafted(survey: FolderSurvey, out: Path, questions: Questions, registry: Registry) -> Draft:
+    """Return a draft; scans decide what the numbers of the arm's rotation mean, if nothing else.
+
+    Raises:
+        FlangeyeError: As :func:`draft_recipe`.
+    """
+    from flangeye.workflow.recipe.draft import draft_recipe, rotation_seen
+    from flangeye.workflow.recipe.draft.evidence import usual_rotations
+
+    given, likely = dict(questions.given), dict(questions.likely)
+    try:
+        return draft_recipe(survey, out, questions, registry)
+    except RecipeError:
+        if questions.open != "rotation":
+            raise
+        drafts = {}
+        for name in usual_rotations():
+            tried = replace(questions, given=given | {"rotation": name}, likely={}, assumed=[])
+            drafts[name] = draft_recipe(survey, out, tried, registry)
+        seen = _seen(drafts["vector"], survey.folder, out, registry, 12)
+        if not seen or not (decided := rotation_seen(drafts, seen)):
+            raise
+        questions.given, questions.likely = given, likely | {"rotation": decided}
+        questions.assumed.clear()
+        return draft_recipe(survey, out, questions, registry)
 
 
 def _seen(

@@ -279,7 +279,7 @@ def test_columns_that_are_named_keep_what_their_names_say(folder: Path) -> None:
     assert recipe(folder).steps[0].params.reader.params.pose == "flange_T_base"
 
 
-@pytest.mark.parametrize("suffix", [".yml", ".npz"])
+@pytest.mark.parametrize("suffix", [".yml", ".npz", ".npy"])
 def test_intrinsics_beside_images_are_used(folder: Path, suffix: str) -> None:
     camera = np.array([[900.0, 0, 320], [0, 901, 240], [0, 0, 1]])
     for name in ("images", "poses"):
@@ -289,6 +289,9 @@ def test_intrinsics_beside_images_are_used(folder: Path, suffix: str) -> None:
         np.savetxt(folder / "poses" / f"pose_{k}.txt", pose)
     if suffix == ".npz":
         np.savez(folder / "calib.npz", mtx=camera, dist=np.zeros((1, 5)))
+    elif suffix == ".npy":
+        np.save(folder / "calib.npy", camera)
+        np.save(folder / "dist_coeffs.npy", np.zeros((1, 5)))
     else:
         storage = cv2.FileStorage(str(folder / "calib.yml"), cv2.FILE_STORAGE_WRITE)
         storage.write("camera_matrix", camera)
@@ -323,6 +326,21 @@ def test_the_samples_poses_as_a_kuka_shows_them_are_the_samples(folder: Path) ->
     np.savetxt(folder / "pendant.txt", rows, delimiter=",", header="X,Y,Z,A,B,C", comments="")
     init()
     np.testing.assert_allclose(read_poses(folder), poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("order", ["xyz", "ZYX"])
+def test_scans_decide_what_three_angles_mean(folder: Path, order: str) -> None:
+    """The face turns in the scans as the arm does, in one convention only."""
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    init("--out", "of_sample.yaml")
+    of_sample = load_recipe(folder.parent / "of_sample.yaml", load_registry()).steps[0].params
+    poses = np.array([r.base_T_flange for r in of_sample.reader(folder).recordings])
+    (folder / "poses.csv").unlink()
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler(order, degrees=True)
+    np.savetxt(folder / "pendant.txt", np.hstack([1e3 * poses[:, :3, 3], turns]), fmt="%.9g")
+    told = init()
+    assert f"columns 4, 5, 6 of pendant.txt: {order} (arm and target turn alike to 0." in told
+    np.testing.assert_allclose(read_poses(folder), poses, atol=1e-6)
 
 
 ARM = np.array([np.block([[t.as_matrix(), p[:, None]], [np.zeros(3), 1]]) for p, t in POSES])

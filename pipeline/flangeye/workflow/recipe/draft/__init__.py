@@ -21,12 +21,15 @@ from flangeye.workflow.recipe.draft.recipe import (
     draft_recipe,
     mounting_seen,
     printed_target,
+    rotation_seen,
     steps_of,
     yaml_of,
 )
 from flangeye.workflow.recipe.draft.survey import Questions, look
 
-__all__ = ["Draft", "Questions", "draft_live", "draft_recipe", "look", "mounting_seen"]
+__all__ = [
+    "Draft", "Questions", "draft_live", "draft_recipe", "look", "mounting_seen", "rotation_seen",
+]  # fmt: skip
 
 
 def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:

@@ -33,6 +33,7 @@ from flangeye.workflow.recipe.draft.evidence import (
     mounting_of,
     poses_by_number,
     size_of,
+    usual_rotations,
     writing_of,
 )
 from flangeye.workflow.recipe.draft.headings import (
@@ -475,8 +476,7 @@ def _writings(
     if pose.rotations == JOINTS:
         return joints
     usual = usual_of(robot.maker if robot else None)
-    # What three numbers of a rotation mean on the arms that are sold
-    named = [given] if given else list(pose.rotations or ("vector", "ZYX", "xyz", "XYZ", "ZYZ"))
+    named = [given] if given else list(pose.rotations or usual_rotations())
     if not given and usual and (not pose.rotations or usual in pose.rotations):
         named = [usual, *named]
     length = questions.given.get(f"{prefix}length") or _length(numbers, pose)

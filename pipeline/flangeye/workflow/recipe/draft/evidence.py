@@ -8,10 +8,10 @@ the robot, and a target's pose from its inverse.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from flangeye.types import Floats
 from flangeye.types.geometry import rigid
 from flangeye.types.pose_formats import AngleUnit, LengthUnit, pose_of_numbers
 from flangeye.workflow.recipe.draft.headings import JOINTS, Headings, PoseColumns
+
+Key = TypeVar("Key")
 
 ROUNDED = 5e-3
 """By how much a written quaternion's length, or a rotation matrix, may be off."""
@@ -220,6 +222,11 @@ class Choice:
     told: str
 
 
+def usual_rotations() -> tuple[str, ...]:
+    """Return what three numbers of a rotation mean on the arms that are sold."""
+    return ("vector", "ZYX", "xyz", "XYZ", "ZYZ")
+
+
 def writing_of(
     arm: Floats, arms: Sequence[Writing], target: Floats, targets: Sequence[Writing]
 ) -> Choice | None:
@@ -234,46 +241,81 @@ def writing_of(
     if len(arm) != len(target) or len(arm) < FEWEST_PAIRS:
         return None
     tried = []
-    angles = {id(w): _turned(w.poses(arm)) for w in arms}
-    seen = {id(w): _turned(w.poses(target)) for w in targets}
+    poses = {id(w): p for w in arms if (p := w.poses(arm)) is not None}
+    seen = {id(w): p for w in targets if (p := w.poses(target)) is not None}
+    angles = {key: _turned(each) for key, each in (poses | seen).items()}
     for a, b in product(arms, targets):
-        one, other = angles[id(a)], seen[id(b)]
-        if one is not None and other is not None:
-            tried.append((_apart(one, other), a, b))
+        if id(a) in poses and id(b) in seen:
+            tried.append((_apart(angles[id(a)], angles[id(b)]), a, b))
     tried.sort(key=lambda each: each[0])
-    # Largest median difference of the angles [rad] at which a convention is taken to fit
-    alike_angle = np.radians(3.0)
-    if not tried or tried[0][0] > alike_angle:
+    if not tried or not _fits(tried[0][0]):
         return None
     best, a, b = tried[0]
     # Two hypotheses that differ by less are both good [rad]
     alike = [each for each in tried if each[0] < CLEARER * max(best, np.radians(0.2))]
     if len(alike) > 1:
-        return _by_places(arm, target, [(a, b) for _, a, b in alike])
+        found = _by_places(((a, b), poses[id(a)], seen[id(b)]) for _, a, b in alike)
+        return found and Choice(*found[0], found[1])
     beyond = f", the next {np.degrees(tried[1][0]):.1f} deg" if len(tried) > 1 else ""
     return Choice(a, b, f"arm and target turn alike to {np.degrees(best):.2g} deg{beyond}")
 
 
-def _by_places(
-    arm: Floats, target: Floats, alike: Sequence[tuple[Writing, Writing]]
-) -> Choice | None:
-    """Return the notation with the smallest scatter of the target's position; None if undecided.
+def rotation_of(poses: Mapping[str, Floats], seen: Floats) -> tuple[str, str] | None:
+    """Return the rotation convention in which arm and target turn alike, with its evidence.
 
-    Permuted quaternions rotate by the same angles, so angles alone cannot decide.
+    Args:
+        poses: (N, 4, 4) poses of the flange, by the convention in which they were read.
+        seen: (N, 4, 4) poses of the target in the camera, or (N, 3) normals of the flange's face.
+
+    Returns:
+        None if no or several conventions fit.
     """
-    some = np.linspace(0, len(arm) - 1, min(len(arm), MOST_PAIRS)).astype(int)
+    if len(seen) < FEWEST_PAIRS or not poses:
+        return None
+    whole = seen.ndim == 3
+    wanted = _turned(seen) if whole else _tilted(seen)
+    angles = {n: _turned(each) if whole else _tilted(each[:, :3, 2]) for n, each in poses.items()}
+    tried = sorted((_apart(each, wanted), name) for name, each in angles.items())
+    best, name = tried[0]
+    if not _fits(best):
+        return None
+    # Two hypotheses that differ by less are both good [rad]
+    alike = [name for apart, name in tried if apart < CLEARER * max(best, np.radians(0.2))]
+    if len(alike) > 1:
+        return _by_places((name, poses[name], seen) for name in alike) if whole else None
+    beyond = f", the next {np.degrees(tried[1][0]):.1f} deg" if len(tried) > 1 else ""
+    return name, f"arm and target turn alike to {np.degrees(best):.2g} deg{beyond}"
+
+
+def _by_places(alike: Iterable[tuple[Key, Floats, Floats]]) -> tuple[Key, str] | None:
+    """Return the hypothesis with the smallest scatter of the target's position, with evidence.
+
+    Permuted quaternions and reversed angles rotate by the same angles, so angles alone cannot
+    decide.
+
+    Args:
+        alike: Hypotheses with the poses of arm and target (N, 4, 4) [m] that they give.
+
+    Returns:
+        None if they decide for none.
+    """
     tried = []
-    for a, b in alike:
-        poses, seen = a.poses(arm[some]), b.poses(target[some])
-        if poses is not None and seen is not None:
-            twins = _residuals_by_twins(poses, seen, ["base", "flange"], ["camera_T_target"])
-            tried += [(residual, a, b) for residual, *_ in twins.values()]
+    for key, poses, seen in alike:
+        some = np.linspace(0, len(poses) - 1, min(len(poses), MOST_PAIRS)).astype(int)
+        both = poses[some], seen[some]
+        twins = _residuals_by_twins(*both, ["base", "flange"], ["camera_T_target"])
+        tried += [(residual, key) for residual, *_ in twins.values()]
     tried.sort(key=lambda each: each[0])
-    others = [each for each in tried if each[1:] != tried[0][1:]]
+    others = [each for each in tried if each[1] != tried[0][1]]
     if not others or others[0][0] < CLEARER * max(tried[0][0], LOOSE_PLACE):
         return None
-    (best, a, b), beyond = tried[0], others[0][0]
-    return Choice(a, b, f"fits to {1e3 * best:.1f} mm, the next to {1e3 * beyond:.0f} mm")
+    (best, key), beyond = tried[0], others[0][0]
+    return key, f"fits to {1e3 * best:.1f} mm, the next to {1e3 * beyond:.0f} mm"
+
+
+def _fits(apart: float) -> bool:
+    """Return whether angles differ by so little as they do in the right convention."""
+    return apart <= math.radians(3.0)
 
 
 def _apart(one: Floats, other: Floats) -> float:
@@ -285,14 +327,18 @@ def _apart(one: Floats, other: Floats) -> float:
     return float(np.median(np.abs(one - other))) / min(max(size, 1e-6), 1.0)
 
 
-def _turned(poses: Floats | None) -> Floats | None:
+def _turned(poses: Floats) -> Floats:
     """Return the angles [rad] between poses one and two apart."""
-    if poses is None or len(poses) < 3:
-        return None
     turns = poses[:, :3, :3]
     pairs = [np.swapaxes(turns[:-k], 1, 2) @ turns[k:] for k in (1, 2)]
     traces = np.trace(np.concatenate(pairs), axis1=1, axis2=2)
     return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+
+
+def _tilted(normals: Floats) -> Floats:
+    """Return the angles [rad] between normals one and two apart."""
+    cosines = [(normals[:-k] * normals[k:]).sum(axis=1) for k in (1, 2)]
+    return np.asarray(np.arccos(np.clip(np.concatenate(cosines), -1, 1)))
 
 
 class Mounting(NamedTuple):

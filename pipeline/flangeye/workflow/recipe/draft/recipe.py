@@ -32,7 +32,7 @@ from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import FLANGE, Floats, Observation, PoseFeature
 from flangeye.workflow.recipe.draft.convention import table_params
-from flangeye.workflow.recipe.draft.evidence import mounting_of
+from flangeye.workflow.recipe.draft.evidence import mounting_of, rotation_of
 from flangeye.workflow.recipe.draft.survey import FolderSurvey, Questions, one_of
 from flangeye.workflow.recipe.load import parse_recipe
 
@@ -48,11 +48,13 @@ class Draft:
         text: The recipe as YAML.
         told: Lines about what was found in the archive.
         files: Contents of the files that it names.
+        poses: (4, 4) pose of the flange as it is read, by the name of the recording.
     """
 
     text: str
     told: Sequence[str]
     files: Mapping[Path, str] = field(default_factory=dict)
+    poses: Mapping[str, Floats] = field(default_factory=dict)
 
 
 def draft_recipe(
@@ -81,8 +83,10 @@ def draft_recipe(
     first: dict[str, Any] = {"path": os.path.relpath(survey.folder, out.parent)}
     first |= {} if reader == "auto" else {"reader": reader}
     first |= _camera(archive, target, questions) if stage == "acquire.images" else {}
-    data = head | {"steps": [{stage: first}, *steps_of(target)]}
-    return Draft(yaml_of(data), _summary(archive, reader))
+    # A scale of the arm's motion is as uncertain as the arm: the estimate has to say so
+    data = head | {"steps": [{stage: first}, *steps_of(target, "scale" not in questions.mended)]}
+    poses = {r.id: r.poses[FLANGE] for r in archive.recordings if FLANGE in r.poses}
+    return Draft(yaml_of(data), _summary(archive, reader), poses=poses)
 
 
 def _robot(survey: FolderSurvey, out: Path, questions: Questions) -> dict[str, Any]:
@@ -269,6 +273,26 @@ def mounting_seen(observations: Iterable[Observation]) -> tuple[str, str] | None
     return _mounting(both) if both else None
 
 
+def rotation_seen(
+    drafts: Mapping[str, Draft], observations: Sequence[Observation]
+) -> tuple[str, str] | None:
+    """Return the convention by which scans show the arm's poses were written, with evidence.
+
+    Args:
+        drafts: Recipes that differ in the convention only, by its name.
+        observations: What the scans of one of them show.
+
+    Returns:
+        None if they decide for none.
+    """
+    shown = [o for o in observations if o.feature.normal is not None]
+    poses = {name: np.array([each.poses[o.id] for o in shown]) for name, each in drafts.items()}
+    whole = all(isinstance(o.feature, PoseFeature) for o in shown)
+    seen = [o.feature.camera_T_target.matrix if whole and isinstance(o.feature, PoseFeature)
+            else o.feature.normal for o in shown]  # fmt: skip
+    return rotation_of(poses, np.array(seen))
+
+
 def _mounting(both: Sequence[tuple[Floats, Floats]]) -> tuple[str, str] | None:
     arm, target = map(np.array, zip(*both, strict=True))
     found = mounting_of(arm, target, ["base", "flange"], ["camera_T_target"])
@@ -411,8 +435,13 @@ def configuration_of(target: Mapping[str, Any], questions: Questions) -> dict[st
     return {} if known else {"name": "eye-on-base", "place": "unknown"}
 
 
-def steps_of(target: Mapping[str, Any]) -> list[Any]:
-    """Return the steps from a scan of a target to the verified pose; none finds one measured."""
+def steps_of(target: Mapping[str, Any], sized: bool = True) -> list[Any]:
+    """Return the steps from a scan of a target to the verified pose; none finds one measured.
+
+    Args:
+        target: The target, its name with parameters; empty where it is measured.
+        sized: Whether the target's size is known.
+    """
     found: list[Any] = []
     if "flange" in target:
         found = ["segment.flange", "fit.rim"]
@@ -422,7 +451,8 @@ def steps_of(target: Mapping[str, Any]) -> list[Any]:
         found = ["segment.sphere", "fit.sphere"]
     elif target:
         found = [{f"fit.{name}": params} for name, params in target.items()]
-    return [*found, "solve.robust", "verify.holdout"]
+    solve = "solve.robust" if sized else {"solve.robust": {"target_size": "unknown"}}
+    return [*found, solve, "verify.holdout"]
 
 
 # --- lines for the person

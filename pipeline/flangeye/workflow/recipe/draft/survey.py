@@ -16,7 +16,7 @@ from flangeye.files.clouds import CONVERSIONS
 from flangeye.files.images import is_depth_image
 from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import is_pointer
-from flangeye.files.scans import CLOUDS, IMAGES, natural, texts_of_points
+from flangeye.files.scans import CLOUDS, IMAGES, is_matrix, natural, texts_of_points
 from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
 from flangeye.workflow.recipe.draft.headings import lists_in, role_in
 
@@ -46,6 +46,7 @@ class Questions:
         assumed: Lines on the defaults used, to print at the end.
         likely: Likely answers from the data with their evidence, by option.
         mended: What corrects the target's poses, as ``reader.corrected`` takes it.
+        open: Option of the question that neither data nor a person answered; empty without one.
     """
 
     given: dict[str, str | None] = field(default_factory=dict)
@@ -53,6 +54,7 @@ class Questions:
     assumed: list[str] = field(default_factory=list)
     likely: dict[str, tuple[str, str]] = field(default_factory=dict)
     mended: dict[str, Any] = field(default_factory=dict)
+    open: str = ""
 
     def ask(
         self,
@@ -93,6 +95,7 @@ class Questions:
         self, flag: str, question: str, default: str | None, example: str, check: Check | None
     ) -> str:
         if self.prompt is None:
+            self.open = flag
             raise RecipeError(f"not known: {question}; add --{flag} {example}".rstrip())
         refused = ""
         while True:
@@ -127,7 +130,7 @@ class FolderSurvey:
     @property
     def clouds(self) -> list[Path]:
         """The clouds, those in texts and archives of arrays too."""
-        found = {*self.of(CLOUDS), *self.points}
+        found = {*(p for p in self.of(CLOUDS) if not is_matrix(p)), *self.points}
         return [path for path in self.files if path in found or is_depth_image(path)]
 
     @property
