@@ -14,7 +14,7 @@ from flangeye.models.loading import load_model
 from flangeye.models.robots import Volume
 from flangeye.models.urdf import robot_from_urdf
 from flangeye.motion.clearance import ArmVolume
-from flangeye.motion.reach import Margins, Reach, Site, poses_near
+from flangeye.motion.reach import Margins, Reach, Site, _sides, poses_near
 from flangeye.types.geometry import invert, rigid, rotation_from_rpy
 from flangeye.units import SI
 from tests.motion.stand_in import LIMITS, MODEL, turned
@@ -276,6 +276,28 @@ def test_the_link_that_ends_in_the_flange_is_behind_its_face(link: int, clear: b
     camera = OVERHEAD.copy()
     camera[:3, 3] = ARM.flange(SHOWN)[:3, 3] + [0.0, 0.0, 0.7]
     assert Reach(robot, scanner(), camera, 0.05)._clear(SHOWN) is clear
+
+
+def test_each_axis_of_a_flange_may_be_the_one_that_is_shown() -> None:
+    """To z, from wherever it points, without a turn that tilts it."""
+    shown = [side.T @ [0.0, 0.0, 1.0] for side in _sides()]
+    found = sorted(tuple(np.round(axis).astype(int).tolist()) for axis in shown)
+    assert np.abs(np.array(shown) - np.round(shown)).max() < 1e-12
+    assert found == sorted(tuple(each) for each in (*np.eye(3, dtype=int), *-np.eye(3, dtype=int)))
+
+
+@pytest.mark.parametrize(("before", "clear"), [(-0.01, True), (0.05, False)])
+def test_what_stands_before_the_flange_of_a_far_scanner_is_in_the_way(
+    before: float, clear: bool
+) -> None:
+    """The line of sight is as wide as the flange, 4 cm here, and ends as far before it."""
+    of_link = invert(ARM.frames(SHOWN)[5]) @ ARM.flange(SHOWN)
+    place = tuple(map(SI, (of_link @ [0.0, 0.0, before, 1.0])[:3]))
+    volume = Volume(link=5, start=place, end=place, radius=SI(0.005))
+    robot = MODEL.model_copy(update={"volumes": (volume,)})
+    camera = OVERHEAD.copy()
+    camera[:3, 3] = ARM.flange(SHOWN)[:3, 3] + [0.0, 0.0, 2.5]
+    assert Reach(robot, scanner(), camera, 0.04)._clear(SHOWN) is clear
 
 
 def test_an_arm_keeps_off_the_scanners_housing() -> None:

@@ -231,6 +231,15 @@ def test_a_tool_is_named() -> None:
     )
 
 
+def test_beside_the_pose_there_is_no_tool() -> None:
+    beside = rigid(np.eye(3), np.array([0.515, 0.1, 0.3]))
+    asked = rigid(np.eye(3), np.array([0.5, 0.1, 0.3]))
+    words = CONVENTIONS["quaternion_xyzw"]
+    assert fault(words.numbers(beside), words, 0.95, asked, Tolerance(0.005, 0.1)) == (
+        "that is 15.0 mm and 0.0 deg from the pose asked for"
+    )
+
+
 def test_a_pose_without_an_explanation_is_only_described() -> None:
     elsewhere = rigid(TILTED[:3, :3], TILTED[:3, 3] + [0.1, 0.0, 0.0])
     assert doubted(CONVENTIONS["kuka"].numbers(elsewhere), "kuka") == (
