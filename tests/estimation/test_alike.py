@@ -6,7 +6,16 @@ import pytest
 from flangeye.estimation.alike import ambiguous, disambiguated
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
-from flangeye.types import BASE, CAMERA, FLANGE, TARGET, Observation, PoseFeature, Transform
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    TARGET,
+    CircleFeature,
+    Observation,
+    PoseFeature,
+    Transform,
+)
 from flangeye.types.geometry import invert, rigid, rotation_exp
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -103,3 +112,57 @@ def test_where_the_place_is_to_be_found_all_captures_mean_the_same_pose() -> Non
     assert told(captures, None) == [k % 2 for k in range(6)]
     assert told([poses[::-1] for poses in captures], None) == [k % 2 for k in range(6)]
     assert told(session(arm, place=place, sure=1), None) == [1, 0, 1, 0, 1]
+
+
+def axes_of(captures):
+    """The same captures of a rod: a point of its axis, and the axis, which may point either way."""
+    upside_down = np.diag([1.0, -1.0, -1.0])
+    out = []
+    for k, (one, *_) in enumerate(captures):
+        pose = one.feature.camera_T_target.matrix
+        ends = [pose[:3, :3], pose[:3, :3] @ upside_down][:: 1 - 2 * (k % 2)]
+        out.append([
+            Observation(
+                one.id,
+                CircleFeature(
+                    centre=pose[:3, 3] + 0.08 * pose[:3, 2],
+                    normal=turn[:, 2],
+                    radii={},
+                    covariance=1e-8 * np.eye(3),
+                    normal_covariance=1e-7 * (np.eye(3) - np.outer(turn[:, 2], turn[:, 2])),
+                    arc_coverage=0.0,
+                    centre_in_flange=np.array([0.0, 0.0, 0.08]),
+                ),
+                one.poses,
+            )
+            for turn in ends
+        ])  # fmt: skip
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_which_way_a_rod_points_is_told_by_what_the_arm_moves_along_it(
+    count: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    arm = [turned(rng) for _ in range(count)]
+    assert told(axes_of(session(arm, seed, sure=count))) == [k % 2 for k in range(count)]
+
+
+def test_a_rod_that_is_only_turned_about_its_axis_and_moved_across_it_points_either_way() -> None:
+    rng = np.random.default_rng(3)
+    across = [turned(rng, (0, 0, 1)) for _ in range(6)]
+    for pose in across:
+        pose[:3, 3] = *rng.normal(0, 0.1, 2), 0.0
+    captures = axes_of(session(across, sure=6))
+    assert told(captures) == [None] * 6
+    why = ambiguous(captures[0])
+    assert why.figures == "its axis may point either way"
+    assert "along its axis" in why.fix
+
+
+def test_which_way_a_rod_points_is_not_told_where_its_place_is_to_be_found() -> None:
+    rng = np.random.default_rng(4)
+    arm = [turned(rng) for _ in range(6)]
+    assert told(axes_of(session(arm, sure=6)), None, last=False) == [None] * 6

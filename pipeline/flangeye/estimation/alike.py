@@ -6,6 +6,10 @@ the controllers report. If ``P`` is known, each pose in a scan gives a camera po
 target's rotation angle between two captures must be the same in the scans and by the controllers.
 True poses of all captures agree in this. False poses agree only while the arm merely turns about,
 and moves along, the axis by which false and true poses differ.
+
+Of a body of revolution a scan shows a point of the axis and the axis, which may point either way.
+The angle between two captures' axes, and how far one point lies along the other's axis, do not
+depend on ``X`` either.
 """
 
 from __future__ import annotations
@@ -15,11 +19,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from flangeye.models.cell import Cell
-from flangeye.types import Floats, Indices, Observation, PoseFeature, Rejected, Transform
+from flangeye.types import (
+    CircleFeature,
+    Floats,
+    Indices,
+    Observation,
+    PoseFeature,
+    Rejected,
+    Transform,
+)
 from flangeye.types.geometry import hat, invert, rotation_log
 
 Poses = Sequence[Observation]
-"""One capture, once for each pose that explains its scan; the features are ``PoseFeature``."""
+"""One capture, once for each pose that explains its scan."""
 
 
 def disambiguated(
@@ -42,13 +54,23 @@ def disambiguated(
 
 def ambiguous(poses: Poses) -> Rejected:
     """Return the rejection of a capture that several poses explain: how they differ, what to do."""
+    why = (
+        f"{len(poses)} poses of the target explain the scan, and the arm's motion does not show "
+        "which is right"
+    )
+    if isinstance(poses[0].feature, CircleFeature):
+        return Rejected(
+            why,
+            "its axis may point either way",
+            "state where the target is (at: flange), and between captures move it by 50 mm and "
+            "more along its axis; or scan the end that differs",
+        )
     one, other, *_ = (feature.camera_T_target.matrix for feature in _features(poses))
     turn = rotation_log((invert(one) @ other)[:3, :3])
     angle = float(np.linalg.norm(turn))
     x, y, z = turn / max(angle, 1e-9)
     return Rejected(
-        f"{len(poses)} poses of the target explain the scan, and the arm's motion does not show "
-        "which is right",
+        why,
         f"they are {np.degrees(angle):.0f} deg apart about ({x:.2f}, {y:.2f}, {z:.2f}) of the "
         "target",
         "between captures turn the target by 20 deg and more about other axes than the one that "
@@ -57,7 +79,7 @@ def ambiguous(poses: Poses) -> Rejected:
 
 
 def _supported(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observation | None]:
-    each = [*held, *([o] for o in sure if isinstance(o.feature, PoseFeature))]
+    each = [*held, *([o] for o in sure if isinstance(o.feature, type(held[0][0].feature)))]
     every = [pose for poses in each for pose in poses]
     ends = {end for pose in every for end in (pose.camera, pose.target)}
     if len(each) < 2 or not {*cell.unknown_frames} <= ends:
@@ -77,13 +99,18 @@ def _apart(cell: Cell, every: Poses) -> Floats:
     at_once = [Transform(cell.frames[n].parent, n, np.eye(4)) for n in unknown]
     ends = cell.ends(dict(zip(cell.unknowns, at_once, strict=True)), every)
     carried = invert(ends.camera) @ ends.target
-    features = _features(every)
-    seen = np.array([one.camera_T_target.matrix for one in features])
-    spread = np.array([one.covariance for one in features])
     placed = not {o.target for o in every} & {*unknown}
-    measure = _off_place if placed else _off_angle
-    same = [[(a.camera, a.target) == (b.camera, b.target) for b in every] for a in every]
-    out = [measure(k, carried, seen, spread) for k in range(len(every))]
+    pairs = [(one.camera, one.target) for one in every]
+    same = np.array([[one == other for other in pairs] for one in pairs])
+    if features := _features(every):
+        seen = np.array([one.camera_T_target.matrix for one in features])
+        spread = np.array([one.covariance for one in features])
+        measure = _off_place if placed else _off_angle
+        out = [measure(k, carried, seen, spread) for k in range(len(every))]
+    else:
+        circles = [one.circle for one in every]
+        out = [_off_axis(k, carried, circles) for k in range(len(every))]
+        same &= placed
     return np.where(same, out, np.nan)
 
 
@@ -113,6 +140,23 @@ def _off_angle(k: int, carried: Floats, seen: Floats, spread: Floats) -> Floats:
     )
     turns = np.trace(spread[:, :3, :3], axis1=1, axis2=2) / 3
     return np.asarray((told - found) ** 2 / (turns[k] + turns))
+
+
+def _off_axis(k: int, carried: Floats, circles: Sequence[CircleFeature]) -> Floats:
+    """Return (M,) differences of axes: their angles, and places along one, scans against arms."""
+    centres, normals = (np.array([getattr(c, n) for c in circles]) for n in ("centre", "normal"))
+    told_at = np.array([
+        where[:3, :3] @ c.centre_in_flange + where[:3, 3]
+        for where, c in zip(carried, circles, strict=True)
+    ])  # fmt: skip
+    axes, arms = carried[:, :3, 2], told_at - told_at[k]
+    told, found = (np.arccos(np.clip(each @ each[k], -1.0, 1.0)) for each in (axes, normals))
+    turns = np.array([np.trace(np.asarray(c.normal_covariance)) / 2 for c in circles])
+    along = arms @ axes[k] - (centres - centres[k]) @ normals[k]
+    spread = np.array([c.covariance for c in circles])
+    shifts = np.einsum("i,mij,j->m", normals[k], spread + spread[k], normals[k])
+    shifts += turns[k] * np.einsum("mi,mi->m", arms, arms)
+    return np.asarray((told - found) ** 2 / (turns + turns[k]) + along**2 / shifts)
 
 
 def _costs(nearest: Floats, starts: Indices) -> Floats:

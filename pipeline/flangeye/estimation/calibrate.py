@@ -400,9 +400,7 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
         seen = ", ".join(f"{c} saw {t} {n} times" for (c, t), n in who.items())
         notes.append(f"solved at once: {seen}")
     agreeing = [o for o, kept in zip(session.observations, found.inliers, strict=True) if kept]
-    plates = [
-        o for o in agreeing if isinstance(o.feature, CircleFeature) and o.feature.normal is not None
-    ]
+    plates = [o for o in agreeing if isinstance(o.feature, CircleFeature) and o.feature.radii]
     if _sees_flange(cell) and plates and found.problem.seen.ranks.max() == 5:
         camera = found.places[found.problem.ends[0][0]]
         notes.append(roll_note(agreeing, camera[:3, :3], found.posterior.covariance[:3, :3]))

@@ -105,14 +105,6 @@ class BodyFit:
         pose = np.linalg.eigvalsh(inner[:6, :6])[freedoms - 1]
         return float(np.sqrt(max(pose, inner[-1, -1] / 2**2)))
 
-    @property
-    def freedoms(self) -> int:
-        """Degrees of freedom of the pose, of six, that the scan determines."""
-        turn = np.linalg.eigvalsh(self.bread[:3, :3])
-        shift = np.linalg.eigvalsh(self.bread[3:6, 3:6])
-        # A direction counts as determined if its deviation is below this share of the prior's
-        return int((np.r_[turn, shift] < (0.05 * UNKNOWN) ** 2).sum())
-
     def covariance(self, model_error: float, distortion: Callable[[Floats], Floats]) -> Floats:
         """Return the (6, 6) covariance (rotation, translation), left perturbation in ``camera``.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property, lru_cache
 from itertools import permutations, product
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,21 @@ QUARTERS = np.array([
 
 LISTED = 160
 """Number of sample points that represent the body's visible part from one direction."""
+
+
+class Symmetry(NamedTuple):
+    """What the shape of a body leaves open of its pose.
+
+    Attributes:
+        freedoms: Number of the pose's directions that the shape determines: 6, of a body of
+            revolution 5, of a ball 3.
+        centre: (3,) point of the axis nearest to the body's centre; of a ball its centre [m].
+        axis: (3,) unit vector along the axis; of a ball without meaning.
+    """
+
+    freedoms: int
+    centre: Floats
+    axis: Floats
 
 
 class Looks(Shape):
@@ -122,15 +137,34 @@ class Looks(Shape):
         ]
 
     @cached_property
-    def freedoms(self) -> int:
-        """Degrees of freedom of the pose that the shape determines: cylinder 5, sphere 3."""
-        place = np.concatenate([self.surface.points, self.ends.points]) - self.centre
-        along = np.concatenate([self.surface.directions, self.ends.directions])
-        jacobian = np.hstack([np.cross(place / self.size, along), along])
-        values = np.linalg.eigvalsh(jacobian.T @ jacobian / len(jacobian))
+    def symmetry(self) -> Symmetry:
+        """The turns that leave the body as it is: of a cylinder about its axis, of a ball all."""
+        points = np.concatenate([self.surface.points, self.ends.points])
+        values, _ = self._held(points, np.concatenate([self.surface.normals, self.ends.directions]))
         # Share of the body's points that show a direction: of facets of a cylinder fewer
         # do
-        return int((values > 1e-4).sum())
+        if not (free := int((values <= 1e-4).sum())):
+            return Symmetry(6, self.centre, np.array([0.0, 0.0, 1.0]))
+        # The corners of facets lie on the round surface itself, the points between them within it.
+        vertices, triangles = self.facets
+        areas = np.repeat(self._mesh.area_faces, 3)
+        _, moves = self._held(vertices[triangles.ravel()], self.smooth.reshape(-1, 3), areas)
+        turns, shifts = np.split(moves[:, :free].T, 2, axis=1)
+        # A turn w about a point q moves the centre c by the shift -w x (q - c), in sizes
+        rows = np.cross(turns[:, None], np.eye(3)).transpose(0, 2, 1).reshape(-1, 3)
+        to_point = np.linalg.lstsq(rows, -self.size * shifts.ravel(), rcond=None)[0]
+        axis = turns[0] / np.linalg.norm(turns[0])
+        axis *= np.sign(axis[np.abs(axis).argmax()])
+        return Symmetry(5 if free == 1 else 3, self.centre + to_point, axis)
+
+    def _held(
+        self, points: Floats, directions: Floats, weights: Floats | float = 1.0
+    ) -> tuple[Floats, Floats]:
+        """Return by how much points hold each direction of the pose (6,), and those (6, 6)."""
+        place = (points - self.centre) / self.size
+        jacobian = np.hstack([np.cross(place, directions), directions])
+        weighted = jacobian * np.reshape(weights, (-1, 1))
+        return np.linalg.eigh(weighted.T @ jacobian / len(points))
 
     def twins(self, pose: Floats) -> Floats:
         """Return poses (K, 4, 4) turned by a cube's rotations, which often look alike."""

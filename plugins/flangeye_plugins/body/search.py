@@ -416,7 +416,7 @@ class BodySearch:
         verdict = judged(self.looks, self._fine, fit.pose, self._tolerance)
         depth = fit.pose[2, :3] @ self.looks.centre + fit.pose[2, 3]
         seen = float(verdict.agree * (self._fine.angle * depth) ** 2 / self.looks.broadest)
-        return FoundPose(fit.pose, verdict, fit.weakest(self.looks.freedoms), seen)
+        return FoundPose(fit.pose, verdict, fit.weakest(self.looks.symmetry.freedoms), seen)
 
     def _twins(self, best: FoundPose) -> Floats:
         """Return the pose, turned by a cube's rotations, where the scan is explained as well."""
@@ -456,9 +456,17 @@ def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
 
 
 def alike(some: Floats, others: Floats, looks: Looks) -> Mask:
-    """Return the mask (A, B) of pose pairs that agree within 12 deg and 6 % of the size."""
-    here, there = (poses[:, :3, :3] @ looks.centre + poses[:, :3, 3] for poses in (some, others))
+    """Return the mask (A, B) of pose pairs that agree within 12 deg and 6 % of the size.
+
+    Turns that leave the body as it is do not count.
+    """
+    freedoms, centre, axis = looks.symmetry
+    here, there = (poses[:, :3, :3] @ centre + poses[:, :3, 3] for poses in (some, others))
     # Limits for unrefined poses: distance of the centres as a share of the size, and rotation
     near = np.linalg.norm(here[:, None] - there, axis=2) < 0.06 * looks.size
-    trace = np.einsum("aij,bij->ab", some[:, :3, :3], others[:, :3, :3])
-    return np.asarray(near & (trace > 1 + 2 * np.cos(float(np.radians(12.0)))))
+    least = np.cos(float(np.radians(12.0)))
+    if freedoms == 6:
+        near &= np.einsum("aij,bij->ab", some[:, :3, :3], others[:, :3, :3]) > 1 + 2 * least
+    elif freedoms == 5:
+        near &= (some[:, :3, :3] @ axis) @ (others[:, :3, :3] @ axis).T > least
+    return np.asarray(near)

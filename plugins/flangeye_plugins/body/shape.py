@@ -56,9 +56,8 @@ class Crossings:
     @cached_property
     def normals(self) -> Floats:
         """Unit normals (N, 3) of the smoothed surface, towards the ray's origin."""
-        mesh, smooth = self.shape._smooth
         weights = np.column_stack([1 - self.uv.sum(axis=1), self.uv])
-        normals = np.einsum("nk,nkc->nc", weights, smooth[mesh.faces[self.facets]])
+        normals = np.einsum("nk,nkc->nc", weights, self.shape.smooth[self.facets])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         away = np.einsum("nc,nc->n", normals, self.directions) > 0
         normals[away] *= -1
@@ -130,8 +129,7 @@ class Shape:
     @property
     def facets(self) -> tuple[Floats, Indices]:
         """Vertices (V, 3) and triangles (T, 3) of the mesh used for ray casting."""
-        mesh = self._smooth[0]
-        return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        return np.asarray(self._mesh.vertices), np.asarray(self._mesh.faces)
 
     @cached_property
     def parts(self) -> tuple[int, Indices]:
@@ -140,9 +138,8 @@ class Shape:
         from scipy.sparse.csgraph import connected_components
 
         vertices, triangles = self.facets
-        corners = np.unique(vertices.round(6), axis=0, return_inverse=True)[1].ravel()
-        a, b, c = corners[triangles].T
-        ones, size = np.ones(2 * len(a)), corners.max() + 1
+        a, b, c = triangles.T
+        ones, size = np.ones(2 * len(a)), len(vertices)
         touching = coo_matrix((ones, (np.r_[a, b], np.r_[b, c])), shape=(size, size))
         count, part = connected_components(touching, directed=False)
         return count, part[a]
@@ -155,28 +152,40 @@ class Shape:
         return trimesh.Trimesh(self.vertices, self.triangles)
 
     @cached_property
-    def _smooth(self) -> tuple[Any, Floats]:
-        """The mesh with vertices split at creases, and the area-weighted vertex normals (V, 3).
+    def smooth(self) -> Floats:
+        """Normals (T, 3, 3) of the smooth surface at each facet's corners, by area.
 
         On a faceted cylinder these normals are radial, so the facets do not fix the rotation about
-        its axis. On a large flat face beside a fillet they are the face's normal.
+        its axis. On a large flat face beside a fillet they are the face's normal. Facets beyond a
+        crease do not count, nor do those across the tip of a cone.
         """
-        import trimesh
-
-        mesh = trimesh.graph.smooth_shade(self._mesh, np.arccos(self.crease), facet_minarea=None)
-        normals = np.zeros(mesh.vertices.shape)
-        np.add.at(normals, mesh.faces, (mesh.face_normals * mesh.area_faces[:, None])[:, None])
-        return mesh, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        faces, normals, areas = (
+            np.asarray(getattr(self._mesh, name))
+            for name in ("faces", "face_normals", "area_faces")
+        )
+        # Pairs of facets that share a corner's vertex: each corner with all corners there
+        corners = faces.ravel()
+        order = np.argsort(corners, kind="stable")
+        count = np.bincount(corners)
+        first, many = (np.cumsum(count) - count)[corners], count[corners]
+        own = np.repeat(np.arange(len(corners)), many)
+        other = order[np.arange(len(own)) - np.repeat(np.cumsum(many) - many - first, many)] // 3
+        beyond = np.einsum("ni,ni->n", normals[own // 3], normals[other]) < self.crease
+        beyond &= normals[own // 3].any(axis=1)  # a facet without area has no normal of its own
+        pulls = np.where(beyond, 0.0, areas[other])[:, None] * normals[other]
+        out = np.stack([np.bincount(own, column, len(corners)) for column in pulls.T], axis=1)
+        length = np.linalg.norm(out, axis=1, keepdims=True)
+        return np.asarray(out / np.maximum(length, 1e-30)).reshape(*faces.shape, 3)
 
     @cached_property
     def _tree(self) -> Any:
         import open3d as o3d
 
-        mesh = self._smooth[0]
+        vertices, triangles = self.facets
         tree = o3d.t.geometry.RaycastingScene(nthreads=1)
         tree.add_triangles(
-            o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.vertices, np.float32)),
-            o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.faces, np.uint32)),
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, np.uint32)),
         )
         return tree
 

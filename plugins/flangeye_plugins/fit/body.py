@@ -17,16 +17,19 @@ from flangeye.types import (
     CAMERA,
     TARGET,
     Capture,
+    CircleFeature,
     FlangeCloud,
     Floats,
     PoseFeature,
     Rejected,
     Transform,
 )
+from flangeye.types.geometry import hat
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
     from flangeye_plugins.body.dense import BodyFit
+    from flangeye_plugins.body.looks import Symmetry
 
 
 class FitBodyParams(Params):
@@ -50,15 +53,18 @@ def fit_body(
     params: FitBodyParams,
     scanner: ScannerModel | None = None,
     capture: Capture | None = None,
-) -> PoseFeature | Rejected:
+) -> PoseFeature | CircleFeature | Rejected:
     """Fit a body to the scan around it: its surface to points, its faces' ends to the scan's edges.
 
     Every scan point is compared with the body along the scanner's ray, so that only visible faces
     count, with robust weights. A scanner loses the outermost points at edges and rounds curved
     surfaces; both effects are estimated with the pose. Errors of neighbouring points are
     correlated, so they count as patches. The covariance includes two smooth fields that no scan
-    shows: the body's deviation from its CAD, and the scanner's distortion. Directions that a
-    symmetric body does not determine get a variance as large as the body.
+    shows: the body's deviation from its CAD, and the scanner's distortion.
+
+    Returns:
+        The body's pose. Of a body of revolution a point of its axis and the axis, as of a circle;
+        of a ball its centre.
     """
     from flangeye_plugins.body.dense import fitted
     from flangeye_plugins.body.looks import prepared
@@ -71,7 +77,8 @@ def fit_body(
             "nothing shows which is right; FlangeCloud.alone gives each of them"
         )
     body = body.at(capture.joints if capture else None)
-    fit = fitted(cloud.cloud.xyz, prepared(body), cloud.camera_T_target)
+    shape = prepared(body)
+    fit = fitted(cloud.cloud.xyz, shape, cloud.camera_T_target)
     if fit is None:
         return Rejected("too few points on the body")
     alone = partial(_somewhere, params.scanner_error)
@@ -79,13 +86,40 @@ def fit_body(
     if refused := _unlike(fit, body.name, params, distortion):
         return refused
     covariance = fit.covariance(params.model_error, distortion)
+    if shape.symmetry.freedoms < 6:
+        return _round(fit.pose, covariance, shape.symmetry)
     figures = {
         "points": float(fit.points),
         "edges": float(fit.edges),
         "noise_m": fit.noise,
-        "freedoms": float(fit.freedoms),
     }
     return PoseFeature(Transform(CAMERA, TARGET, fit.pose), covariance, figures)
+
+
+def _round(pose: Floats, covariance: Floats, symmetry: Symmetry) -> CircleFeature:
+    """Return what a scan shows of a body of revolution, or of a ball.
+
+    Args:
+        pose: (4, 4) ``camera_T_body``; its turn about the axis has no meaning.
+        covariance: (6, 6) of that pose.
+        symmetry: Symmetry of the body.
+    """
+    arm, axis = pose[:3, :3] @ symmetry.centre, pose[:3, :3] @ symmetry.axis
+    # A turn phi of the pose moves the point at an arm from the body's origin by phi x arm.
+    moved = np.hstack([-hat(arm), np.eye(3)])
+    ball = symmetry.freedoms == 3
+    turned = hat(axis)
+    # Drawn along its frame's z the frame is the body's own, else one with its origin on the axis
+    own = ball or symmetry.axis[2] > 1.0 - 1e-6
+    return CircleFeature(
+        centre=arm + pose[:3, 3],
+        normal=None if ball else axis,
+        radii={},
+        covariance=moved @ covariance @ moved.T,
+        normal_covariance=None if ball else turned @ covariance[:3, :3] @ turned.T,
+        arc_coverage=0.0,
+        centre_in_flange=symmetry.centre if own else np.zeros(3),
+    )
 
 
 def _unlike(

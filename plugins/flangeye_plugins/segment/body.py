@@ -12,6 +12,7 @@ from flangeye import Params, stage
 from flangeye.errors import StageError
 from flangeye.models.bodies import LARGEST, SMALLEST, TargetBody
 from flangeye.models.configuration import Configuration
+from flangeye.models.targets import Sphere
 from flangeye.types import (
     BASE,
     Capture,
@@ -23,12 +24,13 @@ from flangeye.types import (
     Rejected,
     Singles,
 )
-from flangeye.types.geometry import invert
+from flangeye.types.geometry import invert, rigid
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from flangeye_plugins.body.looks import Looks
     from flangeye_plugins.body.search import BodySearch, FoundPose
 
 FIRM = 0.004
@@ -74,8 +76,8 @@ def segment_body(
     is taken without a search.
 
     Raises:
-        StageError: The cloud's unit is wrong (for example millimetres), or the body is round, so
-            that its rotation is not observable.
+        StageError: The cloud's unit is wrong (for example millimetres), or a body of revolution is
+            drawn in its carrier's frame with its axis along another one than z.
     """
     from flangeye_plugins.body.dense import FEWEST
     from flangeye_plugins.body.looks import prepared
@@ -90,11 +92,15 @@ def segment_body(
     if len(points) < FEWEST:
         return Rejected("no point between near and far")
     looks = prepared(body)
-    # A round body shows fewer freedoms
-    if looks.freedoms < 6:
+    freedoms, _, axis = looks.symmetry
+    if freedoms == 3:
+        return _ball(capture, looks, params)
+    # The axis of a body of revolution is the only direction in which its pose can be compared.
+    if freedoms == 5 and configuration.place is not None and axis[2] < 1.0 - 1e-6:
         raise StageError(
-            f"{body.name}: the body is rotationally symmetric, so a scan does not determine its "
-            "pose; use another body, or segment.sphere for a ball"
+            f"{body.name}: a body of revolution whose axis is along ({axis[0]:.2f}, {axis[1]:.2f}, "
+            f"{axis[2]:.2f}) of its mesh; draw it with the axis along z of the "
+            f"{configuration.target}, or write target: {{body: {body.name}, at: unknown}}"
         )
     search = BodySearch(points, looks)
     predicted = _predicted(capture, configuration, earlier)
@@ -112,6 +118,20 @@ def segment_body(
     cloud = PointCloud(capture.cloud.frame, around(points, looks, pose, *others))
     towards = -centre / np.linalg.norm(centre)
     return FlangeCloud(cloud, centre, towards, pose, others=np.array(others))
+
+
+def _ball(capture: Capture, looks: Looks, params: SegmentBodyParams) -> FlangeCloud | Rejected:
+    """Return the points of a ball, which has no edges to be found by."""
+    from flangeye_plugins.segment.sphere import SegmentSphereParams, segment_sphere
+
+    x, y, z = centre = looks.symmetry.centre
+    radius = float(np.linalg.norm(looks.surface.points - centre, axis=1).mean())
+    sphere = Sphere(size=radius, centre_in_flange=(x, y, z))
+    limits = SegmentSphereParams.model_construct(near=params.near, far=params.far)
+    found: FlangeCloud | Rejected = segment_sphere(capture, sphere, limits)
+    if isinstance(found, Rejected):
+        return found
+    return replace(found, camera_T_target=rigid(np.eye(3), found.centre - centre))
 
 
 def _searched(

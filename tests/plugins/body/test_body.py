@@ -20,6 +20,7 @@ from flangeye.types import (
     FLANGE,
     TARGET,
     Capture,
+    CircleFeature,
     Earlier,
     FlangeCloud,
     Observation,
@@ -107,7 +108,6 @@ def test_a_gripper_is_found_without_a_guess_and_its_error_is_as_stated() -> None
     assert np.linalg.norm(error[3:]) < 0.5e-3
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1
     assert error @ np.linalg.solve(feature.covariance, error) < 22.5  # 99.9 % of 6 freedoms
-    assert feature.figures["freedoms"] == 6
 
 
 def test_what_is_stated_covers_what_scanner_and_make_do() -> None:
@@ -193,35 +193,65 @@ def test_a_model_that_is_not_the_body_is_refused(change, why) -> None:
     assert why in found(scan(torch), wrong).reason
 
 
-def test_a_cylinder_shows_five_numbers_and_a_sphere_three() -> None:
-    meshes = {
-        5: trimesh.creation.cylinder(0.03, 0.12, sections=96),
-        3: trimesh.creation.icosphere(4, 0.04),
-    }
-    for freedoms, mesh in meshes.items():
-        body = TargetBody("round", np.array(mesh.vertices), np.array(mesh.faces, np.int32))
-        assert prepared(body).freedoms == freedoms
-        feature = fit_body(around(scan(body), POSE), body, FitBodyParams())
-        assert isinstance(feature, PoseFeature), feature
-        assert feature.figures["freedoms"] == freedoms
-        information = np.linalg.eigvalsh(np.linalg.inv(feature.covariance[:3, :3]))
-        assert (information > 1e3).sum() == freedoms - 3
+ROUND = {
+    "rod": trimesh.creation.cylinder(0.03, 0.12, sections=96),
+    "rod of 16 facets": trimesh.creation.cylinder(0.03, 0.12, sections=16),
+    "cone": trimesh.creation.cone(0.05, 0.12, sections=64),
+    "ball": trimesh.creation.icosphere(4, 0.04),
+}
+
+
+def round_body(name: str, place=None) -> TargetBody:
+    mesh = ROUND[name].copy()
+    mesh.apply_transform(np.eye(4) if place is None else place)
+    return TargetBody(name, np.array(mesh.vertices), np.array(mesh.faces, np.int32))
+
+
+@pytest.mark.parametrize("name", ROUND)
+def test_of_a_round_body_its_axis_is_found_and_of_a_ball_its_centre(name: str) -> None:
+    body = round_body(name, rigid(np.eye(3), np.array([0.0, 0.0, 0.08])))
+    at = found(scan(body), body)
+    assert isinstance(at, FlangeCloud), at
+    axis = POSE[:3, 2]
+    each: list[CircleFeature] = [fit_body(one, body, FitBodyParams()) for one in at.alone]
+    assert len(each) == (2 if "rod" in name else 1)  # either end of a rod may be the upper one
+    best = max(each, key=lambda one: 0.0 if one.normal is None else one.normal @ axis)
+    assert best.centre_in_flange[:2] == pytest.approx([0.0, 0.0], abs=1e-6)
+    error = best.centre - POSE[:3, :3] @ best.centre_in_flange - POSE[:3, 3]
+    assert error @ np.linalg.solve(best.covariance, error) < 16.3  # 99.9 % of three
+    if name == "ball":
+        assert best.normal is None and np.sqrt(np.diag(best.covariance)).max() < 0.2e-3
+    else:
+        assert best.normal is not None and best.normal_covariance is not None
+        slant = np.cross(best.normal, axis)
+        assert slant @ np.linalg.pinv(best.normal_covariance) @ slant < 13.8  # of two
+        assert np.sqrt(np.trace(best.normal_covariance)) < np.radians(0.5)
+
+
+@pytest.mark.parametrize("name", ["rod", "cone", "ball"])
+def test_the_axis_of_a_round_body_is_that_of_its_mesh(name: str) -> None:
+    place = rigid(rotation_from_rpy(0.4, -0.9, 0.0), np.array([0.1, -0.05, 0.2]))
+    freedoms, centre, axis = prepared(round_body(name, place)).symmetry
+    assert freedoms == (3 if name == "ball" else 5)
+    away = centre - place[:3, 3]
+    if name == "ball":
+        assert away == pytest.approx(np.zeros(3), abs=1e-4)
+    else:
+        assert abs(axis @ place[:3, 2]) == pytest.approx(1.0, abs=1e-6)
+        assert np.cross(away, place[:3, 2]) == pytest.approx(np.zeros(3), abs=1e-4)
+    assert prepared(GRIPPER).symmetry.freedoms == 6
+
+
+def test_a_round_body_is_drawn_along_z_where_its_place_is_known() -> None:
+    body = round_body("cone", rigid(rotation_from_rpy(0.0, np.pi / 2, 0.0), np.zeros(3)))
+    with pytest.raises(StageError, match=r"axis is along \(1\.00, .*draw it with the axis along z"):
+        found(scan(body), body)
 
 
 def test_a_body_whose_half_turn_looks_the_same_has_several_poses() -> None:
     mesh = trimesh.creation.box((0.16, 0.1, 0.05))
     block = TargetBody("block", np.array(mesh.vertices), np.array(mesh.faces, np.int32))
     assert len(found(scan(block), block).alone) > 1
-
-
-@pytest.mark.parametrize(
-    "mesh",
-    [trimesh.creation.icosphere(4, 0.04), trimesh.creation.cylinder(0.03, 0.12, sections=96)],
-)
-def test_a_round_body_has_no_pose_to_be_found(mesh) -> None:
-    body = TargetBody("round", np.array(mesh.vertices), np.array(mesh.faces, np.int32))
-    with pytest.raises(StageError, match=r"rotationally symmetric.*segment\.sphere for a ball"):
-        found(scan(GRIPPER), body)
 
 
 def test_a_part_that_moves_is_seen_in_what_the_scan_is_off() -> None:

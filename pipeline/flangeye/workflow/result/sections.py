@@ -68,7 +68,12 @@ def standing_warnings(result: Result) -> list[WarningResult]:
     captures were rejected, and a held-out error that contradicts the expected error.
     """
     found = []
-    if weak := [name for name, each in result.transforms.items() if each.unobservable]:
+    # A turn that is open is that of a round target about its own axis, which no pose would show.
+    weak = [
+        name for name, each in result.transforms.items()
+        if any(any(direction[3:]) for direction in each.unobservable or [])
+    ]  # fmt: skip
+    if weak:
         text = f"not observable from these poses: some directions of {' and '.join(weak)}"
         found.append((text, "add the poses that flangeye show RUN --outlook names"))
     if result.transforms and result.status == "unverified":
