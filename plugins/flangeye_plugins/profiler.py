@@ -37,11 +37,11 @@ class TcpParams(Params):
     host: str = Field(min_length=1)
     """Name or address of the sensor."""
     port: int = Field(ge=1, le=65535)
-    """Its TCP port that sends what is measured."""
+    """TCP port on which the sensor sends its measurements."""
     behind: Length = param(gt=0, le=0.2)
-    """How far behind the torch it looks."""
+    """Distance of the measured profile behind the torch."""
     sigma: Length = param("0.05 mm", gt=0)
-    """Standard deviation of one look."""
+    """Standard deviation of the offset in one profile."""
     column: int = Field(1, ge=1)
     """Which column of a line is the bead's offset."""
     separator: str = Field(",", min_length=1, max_length=1)

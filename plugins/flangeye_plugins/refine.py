@@ -44,8 +44,8 @@ class CompensateParams(Params):
     error: Annotated[BoundPart, Choose("error")] = param({"icp": {}})
     """How the remaining error is measured, on a verification view."""
     rotation: bool = True
-    """Apply the error's rotation too, as the paper does. A flange 60 mm across knows a rotation
-    badly, and over the workspace it counts ten times as much."""
+    """Apply the error's rotation too, as the paper does. A flange 60 mm wide determines rotation
+    poorly, and over the workspace a rotation error counts ten times as much."""
 
 
 @stage("refine.compensate")

@@ -73,8 +73,8 @@ def ambiguous(poses: Poses) -> Rejected:
         why,
         f"they are {np.degrees(angle):.0f} deg apart about ({x:.2f}, {y:.2f}, {z:.2f}) of the "
         "target",
-        "between captures turn the target by 20 deg and more about other axes than the one that "
-        "the poses differ by, and move it across that; or scan what is one-sided of it",
+        "between captures turn the target by 20 deg or more about other axes than this one, and "
+        "move it across this axis; or scan an asymmetric part of it",
     )
 
 

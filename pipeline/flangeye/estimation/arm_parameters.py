@@ -18,8 +18,8 @@ from flangeye.estimation.sightings import branches_of
 from flangeye.types import FLANGE, Floats, Indices, Mask, Observation
 
 KNOWN = 0.5
-"""A parameter is identified singly when the poses leave this share of its size, or less, although
-each other one is loose."""
+"""A parameter counts as identified singly if its posterior deviation is at most this share of its
+prior one, with all others free."""
 
 
 @dataclass(frozen=True, eq=False)

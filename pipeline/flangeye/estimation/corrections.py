@@ -15,8 +15,8 @@ from flangeye.types import ArmCorrection, Floats
 from flangeye.types.geometry import levers
 
 CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})
-"""Kinds of errors that a correction has numbers for. Of encoders and sag its field takes what is
-not rigid over the work; the rigid part stays in the camera's pose."""
+"""Kinds of errors that a correction contains. Errors of encoders and sag enter its smooth field by
+their non-rigid part; the rigid part stays in the camera's pose."""
 
 
 def put_right(found: Estimate) -> Floats:

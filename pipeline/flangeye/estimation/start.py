@@ -38,12 +38,12 @@ from flangeye.types.geometry import (
 SETS = 80
 """Small sets drawn: with 40 % of the sightings wrong, four are all right once in eight draws."""
 LEVER = 0.3
-"""A turn counts like what it does so far away [m]: the distance of a target."""
+"""Lever that converts rotations to lengths [m]: a typical distance of a target."""
 NOISE = 0.2e-3, 0.1e-3
 """Noise of an arm's poses beyond the features' own while nothing is known of it: [rad] and [m]."""
 GOOD = 25.0
-"""Times the median square within which a sighting may agree with the start: all that is plausible,
-for the estimate judges again."""
+"""Multiple of the median square up to which a sighting agrees with the initial guess. Generous, as
+the estimate judges again."""
 
 
 def begin(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
@@ -270,8 +270,8 @@ def start_of_circles(problem: Problem) -> dict[str, Floats]:
     form = _form_of(loop)
     if form is None:
         raise CalibrationRefused(
-            "two arms and a circle whose place is not known cannot be solved: give its place, "
-            "which for the flange's own circle is known, or use a marker"
+            "two arms with a circle at an unknown place cannot be solved: state its place, which "
+            "is known for the flange's own circle, or use a marker"
         )
     rows = np.arange(len(loop.seen))
     return form.solve(rows, np.random.default_rng(0))

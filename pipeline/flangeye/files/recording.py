@@ -22,7 +22,7 @@ from flangeye.files.elsewhere import digest_elsewhere
 from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Note, Role
 
 MIN_CAPTURES = 3
-"""Fewer poses determine nothing, and fewer rows, lists or files are not a list of poses."""
+"""Fewest poses of a calibration; fewer rows, lists or files are not taken for a list of poses."""
 MIN_SPREAD = 1e-3
 """Largest distance of a flange from their mean [m] below which the arm has not moved at all."""
 MAX_REACH = 20.0
@@ -246,8 +246,8 @@ def check_distinct_clouds(recordings: Sequence[Recording], digests: dict[Path, s
             continue
         if other.role != recording.role:
             raise StageError(
-                f"{recording.cloud}: is the verification cloud {_name(other)} again; a cloud that "
-                "verifies must not be calibrated with"
+                f"{recording.cloud}: is the verification cloud {_name(other)} again; a "
+                "verification cloud must not be used to calibrate"
             )
         raise StageError(f"{recording.cloud}: has the same content as {_name(other)}")
 

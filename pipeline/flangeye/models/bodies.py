@@ -102,7 +102,7 @@ class ArmBody(TargetBody):
         """
         if joints is None or len(joints) != self.arm.n:
             raise StageError(
-                f"{self.name}: how the arm stands follows from its joint angles, and a capture has "
+                f"{self.name}: the arm's posture follows from its joint angles, but a capture has "
                 "none: record them"
             )
         return _posed(self, tuple(map(float, joints)))

@@ -142,7 +142,7 @@ class RobotModel(Model):
     flange: FlangeDetails = FlangeDetails()
     volumes: tuple[Volume, ...] = ()
     volumes_missing: str = ""
-    """Why there are none, where a plan needs them."""
+    """Reason why there are no volumes, shown to a plan that needs them."""
     repeatability: Length = param("0.1 mm")
     joint_speed: AngularSpeed = param("180 deg/s", gt=0)
     """Of the slowest joint, as the maker has it: no recipe may ask for more."""

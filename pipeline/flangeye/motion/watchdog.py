@@ -33,7 +33,7 @@ from flangeye.motion.route import Leg
 from flangeye.motion.supervision import RememberedState, SafetyFault, Supervisor
 
 LEADING = 1
-"""Priority of the thread that leads the arm; its guard's is higher."""
+"""Priority of the thread that servos the arm; that of its guard is higher."""
 
 
 def take_precedence(priority: int) -> None:
@@ -54,13 +54,13 @@ def precedence(priority: int) -> Iterator[None]:
 
 
 BEAT = signal.SIGALRM
-"""What the program writes to the alarm as long as it lives; every other signal stops the arm."""
+"""Signal number that the running program writes to the alarm pipe; any other stops the arm."""
 
 STOPS = {signal.SIGINT: "Ctrl-C", signal.SIGTSTP: "Ctrl-Z"}
 """Signals as the operator knows them."""
 
 AT_REST = 1.0
-"""Longest silence of program or guard while the arm stands, and of a program that led it [s]."""
+"""Longest silence of program or guard while the arm rests, and of a program that servoed it [s]."""
 
 
 class GuardConfig(NamedTuple):

@@ -116,10 +116,10 @@ class CalibratedLens(NamedTuple):
         if abs(stated / found - 1) < max(0.02, 5 * self.deviations[0] / found):
             return None
         return Warn(
-            f"the camera's calibration says a focal length of {stated:.0f} px, {self.views} views "
-            f"of the board say {found:.0f} +- {self.deviations[0]:.0f} px, which was taken",
-            "calibrate the camera anew, or give the calibration of these images: another camera, "
-            "lens or image size has another one",
+            f"the camera's calibration states a focal length of {stated:.0f} px; {self.views} "
+            f"views of the board give {found:.0f} +- {self.deviations[0]:.0f} px, which is used",
+            "calibrate the camera again, or give the calibration that belongs to these images: it "
+            "changes with camera, lens and image size",
         )
 
     def note(self) -> str:
@@ -203,7 +203,7 @@ def _not_shown(
     # Squares alone look the same in a mirror
     marked = board.kind in ("charuco", "marker")
     if marked and isinstance(find_corners(board, mirrored), Corners):
-        instead = "it shows the board in a mirror: switch off that the driver flips images"
+        instead = "it shows the board mirrored: switch off image flipping in the driver"
     what = board.kind if board.kind == "marker" else f"{board.kind}, {board.columns} x {board.rows}"
     return StageError(
         f"none of {len(missed)} of the {count} images, spread over all, shows the board ({what}); "

@@ -325,7 +325,7 @@ class LiveSession:
         during = within(samples, scan.started_ns, scan.ended_ns)
         if not during:
             return _rejected(
-                stop, "the exposure began before the arm was there, or ended on another clock"
+                stop, "the exposure began before the arm arrived, or its times are of another clock"
             )
         moved = movement(during)
         if moved > self.moved:

@@ -58,7 +58,7 @@ class OpeningParams(Params):
     leave_out: tuple[str, ...] = ()
     """Ids of poses to leave out."""
     fewest: int = Field(MIN_CAPTURES, ge=1)
-    """Refuse fewer captures; of fewer than three no calibration is made, but one can be checked."""
+    """Fewest captures to accept. A calibration needs three; a check can do with fewer."""
 
 
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:

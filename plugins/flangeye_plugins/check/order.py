@@ -273,12 +273,12 @@ def _repeats(
     wrong[after[moved]] = True
     made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
     if wrong.any() and not made_up:
-        told = f"{wrong.sum()} of {len(session)} times the {what} is an earlier one to the last "
+        told = f"{wrong.sum()} of {len(session)} {what}s repeat an earlier one to the last "
         yield _left_out(
             session,
             wrong,
             f"repeated {what}",
-            f"{told}digit, although the arm had moved: it is stale",
+            f"{told}digit, although the arm had moved: they are stale",
         )
 
 
@@ -366,9 +366,9 @@ def tool(session: RecordedSession) -> Findings:
     if not told or (session.seconds is not None and not shows):
         return
     what = (
-        f"the seen target is {' and '.join(told)}, constantly: the poses are probably those of a "
-        "tool set in the controller, or it is mounted there, which configuration: {place: "
-        "unknown} says"
+        f"the target is always seen {' and '.join(told)}: the poses are probably those of a tool "
+        "set in the controller; if the target is mounted there, write configuration: {place: "
+        "unknown}"
     )
     if turn and session.seconds is None:
         null = fit_of(session)

@@ -193,13 +193,13 @@ def _left_open(turn: float, shift: float) -> str:
     if turn >= TURN:
         degrees = np.degrees(turn)
         known.append(
-            f"its turn to {degrees:.2g} deg only" if degrees < 90 else "its turn not at all"
+            f"rotation to {degrees:.2g} deg only" if degrees < 90 else "rotation not at all"
         )
     if shift >= SHIFT:
         known.append(
-            f"its place to {shift * 1e3:.3g} mm only" if shift < 1 else "its place not at all"
+            f"position to {shift * 1e3:.3g} mm only" if shift < 1 else "position not at all"
         )
-    return f"of the camera, {' and '.join(known)} is known"
+    return f"the poses determine the camera's {' and its '.join(known)}"
 
 
 def _missing(session: RecordedSession, needs: bool, spread: float, axes: float) -> str:
@@ -264,10 +264,10 @@ def _offset_unknown(session: RecordedSession) -> Findings:
     if not (known := offset_left_open(session)):
         return
     spread, axes = _rotations(session)
-    told = f"{known * 1e3:.2g} mm" if known < 1 else "nothing"
+    told = f"known to {known * 1e3:.2g} mm only" if known < 1 else "not observable"
     what = (
         f"the poses turn by {np.degrees(spread):.2g} deg at most, {np.degrees(axes):.2g} deg about "
-        f"a second axis: a constant offset of what is seen from the flange is known to {told} only"
+        f"a second axis: a constant offset of the target from the flange is {told}"
     )
     yield Finding("little rotation", what, "turn the flange by 20 deg and more about two axes "
                   "to be sure of that", note=True)  # fmt: skip

@@ -209,9 +209,9 @@ def exchanged(session: RecordedSession) -> Findings:
     carried_by = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
     name, told, fix, corrected_session = _choices(session, readings)
     what = (
-        f"as they are read, the arm carries the {carried_by[session.carried][0]} "
-        f"{carried:.2f} m from its flange, and the {carried_by[session.carried][1]} stands "
-        f"{standing:.2f} m from its base: rather {told}, which fits as well"
+        f"as the poses are read, the {carried_by[session.carried][0]} is {carried:.2f} m from the "
+        f"flange that carries it, and the {carried_by[session.carried][1]} {standing:.2f} m from "
+        f"the base: probably {told}, which fits as well"
     )
     misfit = fit_of(session).misfit()
     # Whatever explains errors comes first
@@ -232,8 +232,8 @@ def axes(session: RecordedSession) -> Findings:
     turn = optical(found)
     read = session.read_with(target={"axes": found})
     mended = replace(read, centres=session.centres @ turn.T, rotations=turn @ session.rotations)
-    who = {"opengl": "OpenGL has them, z backward", "ros": "bodies have them in ROS, x forward"}
-    what = f"the camera's axes are as {who[found]}: the targets lie along that"
+    who = {"opengl": "OpenGL, z backward", "ros": "a ROS body frame, x forward"}
+    what = f"the camera's axes are those of {who[found]}: the targets lie in that direction"
     # What explains errors comes first
     yield Finding("camera axes", what, mended.step(), gain=0.0, corrected_session=mended)
 
@@ -281,7 +281,7 @@ def _with_exchanged_columns(session: RecordedSession) -> Iterator[tuple[str, str
             changes = {"columns": tuple(other)}
             read = session.again({} if of else changes, changes if of else {})
             axes = " and ".join(("xyz"[first], "xyz"[second]))
-            what = f"{axes} of the {whose}'s positions stand in each other's columns"
+            what = f"the columns of {axes} of the {whose}'s positions are exchanged"
             yield "exchanged columns", what, read
 
 

@@ -261,7 +261,7 @@ def _wrong_marker(session: RecordedSession, kind: str, factor: float) -> tuple[s
         return what, session.read_with(target={"scale": float(f"{factor:.4f}")}).step()
     fix = f"measure it after printing: its lengths in the fit step times {factor:.4f}"
     if session.acquire == "acquire.images":  # where the target stays near the camera's axis
-        return f"{what}, or {focal}", f"{fix}; where the print is as the recipe states: {calibrate}"
+        return f"{what}, or {focal}", f"{fix}; if the print has the stated size: {calibrate}"
     return what, fix
 
 
@@ -310,8 +310,8 @@ def rounding(session: RecordedSession) -> Findings:
         if step is not None and step / 2 >= 0.5 * session.limit:
             what = (
                 f"positions of {whose} are whole multiples of {1e3 * step:g} mm, and the recipe "
-                f"asks for {1e3 * session.limit:g} mm; if they were rounded, that alone is "
-                f"{1e3 * step / 2:.2g} mm"
+                f"asks for {1e3 * session.limit:g} mm; if they were rounded, that alone is an "
+                f"error of {1e3 * step / 2:.2g} mm"
             )
             fix = f"write positions with {1 + round(-np.log10(step))} or more decimals of a metre"
             yield Finding("rounded", what, fix, note=True)

@@ -73,8 +73,8 @@ def fit_body(
         return Rejected("nothing says where the body is; segment.body comes before fit.body")
     if len(cloud.others):
         return Rejected(
-            f"{1 + len(cloud.others)} poses of {body.name} explain the scan, and of a single one "
-            "nothing shows which is right; FlangeCloud.alone gives each of them"
+            f"{1 + len(cloud.others)} poses of {body.name} explain the scan, and a single scan "
+            "does not show which is right; FlangeCloud.alone gives each of them"
         )
     body = body.at(capture.joints if capture else None)
     shape = prepared(body)
@@ -135,9 +135,10 @@ def _unlike(
     if fit.odd > chi2_quantile(0.99, len(fit.lost) + 1):
         low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
         return Rejected(
-            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}, more "
-            "unlike from side to side than a scanner's are: it rests on other edges than its own, "
-            "or its mesh is another body's; scan from where more of its ends are seen"
+            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}; they "
+            "differ more from side to side than a scanner's edge loss: the fit used edges of "
+            "another object, or the mesh is of another body; scan from where more of its ends are "
+            "seen"
         )
     larger, unsure = fit.oversize, fit.unsure(params.model_error, distortion)
     if (larger / unsure) ** 2 > chi2_quantile(0.99, 1):

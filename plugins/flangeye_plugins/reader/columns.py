@@ -125,8 +125,8 @@ class JointsParams(Params):
     """Columns of the joint angles of the same poses."""
 
     joints: tuple[Column, ...] = ()
-    """Columns of the joint angles, from the base, where they were recorded: what is wrong with an
-    arm is estimated from them, and a link's place needs them."""
+    """Columns of the joint angles, base first, if they were recorded. Errors of the arm are
+    estimated from them, and the pose of a link needs them."""
     joint_unit: Literal["rad", "deg"] = "rad"
     """Unit of the joint angles; with rad, joints that slide are in m."""
 

@@ -91,11 +91,11 @@ class CorrectedParams(Params):
     target: PoseMistake = Field(default_factory=PoseMistake)
     """What was wrong with ready-made markers and centres."""
     exchanged: bool = False
-    """The robot's poses were read for the markers', and these for those."""
+    """The robot's and the markers' poses were exchanged."""
     offset: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    """What was seen, from the point whose poses were recorded, in its frame."""
+    """Offset of the seen target from the recorded point, in the frame of that point."""
     shift: int = 0
-    """Number of poses by which each scan's pose follows it."""
+    """Number of rows by which each scan's own pose was recorded later."""
     shift_from: str | None = None
     """Id of the first scan that is shifted."""
     backwards: bool = False

@@ -81,8 +81,8 @@ def register(
     best, seen = found[0].verdict.score, found[0].seen
     if seen < limits.seen:
         raise CalibrationRefused(
-            f"{STAGE}: poor fit: of what the part shows from its broadest side {seen:.0%} was "
-            f"seen, at least {limits.seen:.0%} is needed; {_look(workpiece)}"
+            f"{STAGE}: poor fit: {seen:.0%} of the part's broadest view was seen, at least "
+            f"{limits.seen:.0%} is needed; {_look(workpiece)}"
         )
     goes_on = found[0].verdict.goes_on / max(found[0].verdict.agree, 1)
     refuted = goes_on + search.refuted(fit.pose, lambda at: np.ones(len(at), dtype=bool))
@@ -162,8 +162,8 @@ def _refuse_missing(
 ) -> None:
     if share > limits.refuted:
         raise CalibrationRefused(
-            f"{STAGE}: poor fit: where the scanner looked at {what}, {share:.0%} of the surface is "
-            f"not there, at most {limits.refuted:.0%} may be; {_look(workpiece)}"
+            f"{STAGE}: poor fit: the scanner sees through {share:.0%} of {what}, at most "
+            f"{limits.refuted:.0%} is allowed; {_look(workpiece)}"
         )
 
 

@@ -18,7 +18,7 @@ from flangeye_plugins.seam.rough import JointPlace, Spline, turn
 from flangeye_plugins.seam.template import OFFSETS, Section
 
 WIDE = 18e-3
-"""From a face's end, what of it takes part [m]: plates are flat so far."""
+"""Width of a face, from its end, whose points are fitted [m]; plates are flat over this width."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from flangeye_plugins.body.search import BodySearch, FoundPose
 
 FIRM = 0.004
-"""Largest standard deviation of what a scan shows least of a body's pose and scale, in its sizes or
-radians: what fits by chance is seldom held in all directions, and a corner fits any size."""
+"""Largest standard deviation of the least certain direction of a body's pose and scale, in sizes of
+the body or radians. A chance fit is seldom certain in all of them, and a corner fits any size."""
 
 
 class SegmentBodyParams(Params):
@@ -48,8 +48,7 @@ class SegmentBodyParams(Params):
     min_coverage: float = param(0.3, gt=0, le=1)
     """Smallest share of the body's view to be seen."""
     min_trust: float = param(0.99, gt=0, le=1)
-    """Of what is seen where the body should be and right beside it, the smallest share that is as
-    the body makes it."""
+    """Smallest share of the rays at the body and right beside it that agree with it."""
 
     def passed_by(self, found: FoundPose) -> bool:
         """Return whether a candidate pose satisfies these parameters."""

@@ -94,7 +94,7 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
         solved = solve_without(calibration, solve, deals)
     except (StageError, CalibrationRefused) as error:
         return Verification(
-            False, f"without one fold of {len(deals)} there is no answer: {error}", {}
+            False, f"the calibration without one of {len(deals)} folds fails: {error}", {}
         )
     standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
     used = np.array([pair.used for pair in calibration.pairs])
@@ -229,16 +229,16 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
     readings = meant(pairs, near, far, next(iter(cell.arms.values()), None))
     if Reading() not in readings:
         return (
-            f"the arm would carry the one {near:.2f} m from its flange, the other would "
-            f"stand {far:.2f} m from its base: probably "
-            f"{readings[0].mistake(pairs.in_hand)}, which fits as well; if they are right, state "
-            "the target's place (configuration: {place: …})"
+            f"{carried.child} would be {near:.2f} m from the flange, and {standing.child} "
+            f"{far:.2f} m from the base: probably {readings[0].mistake(pairs.in_hand)}, which fits "
+            "as well; if the distances are right, state the target's place (configuration: "
+            "{place: …})"
         )
     axes = other_axes(markers[:, :3, 3]) if optical else None
     side = {"opengl": "behind", "ros": "beside"}
     return axes and (
-        f"all targets are {side[axes]} the camera: its frame has not z forward; if that is meant, "
-        "say verify.holdout: {optical: false}"
+        f"all targets are {side[axes]} the camera: z of its frame is not forward; if that is "
+        "intended, write verify.holdout: {optical: false}"
     )
 
 

@@ -28,7 +28,7 @@ class PassParams(Params):
     across: Length = param("0 mm", ge=-0.03, le=0.03)
     """Offset to the left of the seam."""
     up: Length = param("3 mm", gt=0, le=0.05)
-    """Higher than the root pass, the finger too; it must clear what was welded."""
+    """Height above the root pass, of the finger too; it must clear the bead."""
     weave_width: Length = param("0 mm", ge=0, le=0.03)
     """As in the root pass."""
 
@@ -78,53 +78,52 @@ class Following(Params):
     turn_rate: AngularSpeed = param("20 deg/s", gt=0, le=2.0)
     """Largest angular velocity of the tool."""
     reach: Length = param("8 mm", gt=0)
-    """How far from the plan the wall is sought at the start."""
+    """Largest distance from the plan at which the wall is sought at the start."""
     friction: float = Field(0.3, ge=0, le=1)
-    """Largest coefficient of the tip on the work to reckon with."""
+    """Largest coefficient of friction to expect between tip and work."""
     max_error: Length = param("1 mm", gt=0)
     """The weld is refused or stopped where the torch's stated bound exceeds this."""
     sigmas: float = Field(3.0, gt=0, le=6)
-    """The torch's bound holds along the whole seam as surely as a normal value is within so many
-    standard deviations: it fails in one weld of 370 for 3, in one of 16,000 for 4. On top comes the
-    control error."""
+    """Coverage of the torch's error bound along the whole seam, in standard deviations of a normal
+    distribution: it fails in one weld of 370 for 3, in one of 16,000 for 4. The control error is
+    added to the bound."""
     arm_sigma: Length = param("0.03 mm", ge=0)
-    """Standard deviation of what the arm is off by, across the seam, when the tip passes a place;
-    the torch's passing has the same."""
+    """Standard deviation of the arm's position error across the seam, once when the tip passes a
+    place and once when the torch does."""
     distortion: Length = param("0.05 mm", ge=0)
-    """Standard deviation of how far heat moves the seam between the tip's and the torch's passing
-    one place."""
+    """Standard deviation of the seam's thermal displacement after the tip has passed a place and
+    before the torch does."""
     gain_drift: float = Field(0.05, ge=0, le=1)
-    """Standard deviation of the finger's gain after a minute."""
+    """Standard deviation of the drift of the finger's gain in a minute."""
     joint: JointKind = "groove"
     """groove, butt and corner hold the tip between two walls; in a fillet or lap joint it lies on a
     flat plate against a wall on its side. Where the plan knows a half_angle both walls lean by it
     from the opening."""
     root_gap: Length = param("0 mm", ge=0)
-    """Between the plates of a butt joint with square edges: the tip rests on these."""
+    """Gap between the plates of a butt joint with square edges, on which the tip rests."""
     work_angle: Angle = param("0 deg", ge=-np.pi / 3, le=np.pi / 3)
     """The tool's upper end leans away from the pressed wall by this."""
     travel_angle: Angle = param("0 deg", ge=-np.pi / 6, le=np.pi / 6)
     """The tool's upper end leans forwards along the seam by this."""
     offset_across: Length = param("0 mm", ge=-0.02, le=0.02)
-    """How far to the left of the seam the torch is led."""
+    """Offset of the torch to the left of the seam."""
     ends: Length | None = param(None, ge=0, le=0.03)
-    """How far the seam's ends may be off along the plan. Where it is given the tip feels for both:
-    it goes back until it falls off the start, and, between two walls, on until it falls off the
-    end. Where it does not, the torch welds so far beyond."""
+    """Largest distance of the seam's true ends from the planned ones. If given, the tip looks for
+    them: it moves back until it falls off the start and, between two walls, on until it falls off
+    the end. Beyond an end that it does not find, the torch welds this much further."""
     overlap: Length = param("30 mm", gt=0)
-    """How far before the stop the torch begins again, to go on; a seam that goes once around is
-    welded so far over its start."""
+    """Length of the bead before a stop that a resumed weld covers again; also the length by which a
+    closed seam is welded over its start."""
     weave_width: Length = param("0 mm", ge=0, le=0.03)
-    """The torch swings across the seam by this from side to side, the tool turning about its
-    tip."""
+    """Width of the weave across the seam, from side to side; the tool turns about its tip."""
     weave_frequency: float = Field(1.0, gt=0, le=10)
-    """How often it does in a second."""
+    """Frequency of the weave [Hz]."""
     passes: tuple[PassParams, ...] = Field((), max_length=20)
-    """Passes after the root's, in their order."""
+    """Passes after the root pass, in order."""
     blind: Duration = param("500 ms", gt=0)
-    """Without an image of the tag for longer while the arc burns, or for four times as long before,
-    the weld is stopped. After a fifth of this it slows down, after three tenths the arm stands
-    until one comes."""
+    """Longest time without an image of the tag while the arc burns, four times as long before; then
+    the weld is stopped. After a fifth of it the weld slows down, after three tenths the arm waits
+    for an image."""
 
     @property
     def stale(self) -> float:
@@ -166,7 +165,7 @@ class WeldTactileParams(Following):
     finger: FingerPath = param("srm")
     """One of data/fingers, or a .yaml file of one's own."""
     sensor: Annotated[BoundPart, Choose("sensor")]
-    """What gives the finger's images, for example {opencv: {device: 0}}."""
+    """Source of the finger's images, for example {opencv: {device: 0}}."""
     look: Annotated[BoundPart, Choose("profiler")] | None = None
     """A profile sensor that sees the bead behind the torch, for example {tcp: {host: 192.168.1.20,
     port: 9000, behind: 30 mm}}. The thermal distortion and torch offset that it measures are
@@ -183,10 +182,10 @@ class WeldTactileParams(Following):
     """Tip and torch go round the plan's sharp corners without a stop, on arcs of this radius.
     Without it the torch stops there: each leg is a step."""
     resume: RecipeFile | None = None
-    """The run.mcap of a weld that was stopped: goes on with what was felt."""
+    """The run.mcap of a stopped weld, which is resumed with its measurements."""
     prior: RecipePath | None = None
-    """A .yaml file of what earlier welds have found of tip, play and clock: read where it exists,
-    written when a weld is done; delete it to begin anew."""
+    """A .yaml file with estimates of tip, play and clock from earlier welds. It is read if present
+    and written after a weld; delete it to begin anew."""
 
     @model_validator(mode="after")
     def _follows_by_touch(self) -> Self:

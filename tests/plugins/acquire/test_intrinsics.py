@@ -81,7 +81,7 @@ def test_a_calibration_that_the_images_contradict_is_said(views: Any) -> None:
     found = lens_of(views, BOARD, Image(views["0"], wrong, np.zeros(0)))
     said = found.against(wrong)
     assert said is not None
-    assert said.startswith("the camera's calibration says a focal length of 1400 px, 12 views of")
+    assert said.startswith("the camera's calibration states a focal length of 1400 px; 12 views of")
     assert found.against(MATRIX) is None
 
 
@@ -118,7 +118,7 @@ def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_name
 def test_a_board_in_a_mirror_is_named_as_that() -> None:
     board = Board("charuco", 7, 5, 0.03, 0.022)
     seen = {name: pixels[:, ::-1] for name, pixels in images(board, 9, 0.2).items()}
-    with pytest.raises(StageError, match="0: it shows the board in a mirror: switch off that"):
+    with pytest.raises(StageError, match="0: it shows the board mirrored: switch off image"):
         lens_of(seen, board)
 
 

@@ -187,7 +187,7 @@ def test_three_poses_cannot_be_held_out() -> None:
     result = verify_holdout(svd(simulate(3)), svd, HoldoutParams())
     assert not result.passed
     assert result.reason == (
-        "without one fold of 3 there is no answer: 3 poses needed, 2 given: "
+        "the calibration without one of 3 folds fails: 3 poses needed, 2 given: "
         "add poses, or see why captures were set aside"
     )
 
@@ -214,7 +214,10 @@ def test_an_unsolvable_fold_is_said_and_not_raised() -> None:
         raise StageError("no")
 
     result = verify_holdout(svd(simulate(10)), refusing, HoldoutParams())
-    assert (result.passed, result.reason) == (False, "without one fold of 5 there is no answer: no")
+    assert (result.passed, result.reason) == (
+        False,
+        "the calibration without one of 5 folds fails: no",
+    )
 
 
 def test_two_folds_are_enough_and_one_is_not() -> None:

@@ -153,9 +153,9 @@ def test_an_arm_that_rests_while_the_other_moves_is_no_stale_pose() -> None:
 def test_what_cannot_show_is_said_with_the_reason() -> None:
     idle = examine(session_of("arm-2"), CHECKS).idle
     assert idle == {
-        "check.direction": "the camera's link is where the joint angles say",
-        "check.convention": "the camera's link is where the joint angles say",
-        "check.exchanged": "the camera's link is where the joint angles say",
+        "check.direction": "the poses of the camera's link follow from joint angles",
+        "check.convention": "the poses of the camera's link follow from joint angles",
+        "check.exchanged": "the poses of the camera's link follow from joint angles",
         "check.axes": "the markers were found in images or clouds, whose frame is known",
         "check.flips": "no marker's whole pose was measured",
         "check.scatter": "no marker's whole pose was measured",

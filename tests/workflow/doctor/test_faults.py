@@ -460,7 +460,7 @@ def test_a_size_in_images_may_be_the_focal_length_too() -> None:
     session = replace(session_of("marker"), acquire="acquire.images", board=board)
     finding = only(replace(session, centres=session.centres * 1.05))
     assert "or the camera's focal length is 0.95" in finding.what
-    assert "where the print is as the recipe states: - acquire.images: {" in finding.fix
+    assert "if the print has the stated size: - acquire.images: {" in finding.fix
     focal = only(replace(session, centres=session.centres * [1.0, 1.0, 1.1]))
     assert [line["acquire.images"]["board"] for line in focal.lines] == [board]
 

@@ -100,7 +100,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
     [
         (
             TWO.replace("marker: arm", "marker: amr"),
-            "r.yaml:2: cell.targets.marker.on: 'amr' is nothing that carries: write base or arm",
+            "r.yaml:2: cell.targets.marker.on: nothing can stand on 'amr': write base or arm",
         ),
         (
             TWO.replace("right: base", "arm: base"),
@@ -121,7 +121,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         ),
         (
             "robot: ur5\n" + TWO,
-            "r.yaml:3: cell: says itself what stands where; leave out robot",
+            "r.yaml:3: cell: states all mountings itself; leave out robot",
         ),
         (
             TWO.replace("right: base", "right: {on: base, link: 3}"),
@@ -134,7 +134,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         ),
         (
             TWO.replace("right: base", "right: arm_link3"),
-            "r.yaml:2: cell.cameras.right.on: 'arm_link3' is nothing that carries: write base or "
+            "r.yaml:2: cell.cameras.right.on: nothing can stand on 'arm_link3': write base or "
             "arm; a link is written {on: arm, link: 3}",
         ),
         (

@@ -33,19 +33,18 @@ KINDS = {
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
 ANEW = {"base": (1.0, 0.5), "flange": (1.2, 0.15), "each": (0.4, 0.1)}
-"""Typical turn [rad] and shift [m] where the joints are not known: common to all poses, of the base
-and in the flange, and of each pose alone. They are those of a UR5e and a Panda
-with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35
-degrees."""
+"""Typical rotation [rad] and translation [m] of the arm's error if the joints are unknown: at the
+base and at the flange, common to all poses, and of each pose alone. Values of a UR5e and a Panda
+with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35 deg."""
 COMMON = "common"
-"""The kind of what all poses have in common: reported coordinates are right as they are."""
+"""Kind of the errors common to all poses, which do not matter in reported coordinates."""
 ACCURACY = 0.3e-3
 """Typical deviation of a joint's zero where no file states it [rad]: the catalogue arms'."""
 QUALITY = 4.0
-"""By how many times an arm may be better or worse than its file, one sigma: joint accuracy is on no
-data sheet, and arms of one maker differ tenfold."""
+"""Factor by which an arm may be better or worse than its file, one sigma. No data sheet states the
+accuracy of joints, and arms of one maker differ tenfold."""
 EACH = 1.8
-"""By how many times each kind may be larger or smaller beside the arm's quality, one sigma."""
+"""Factor by which each kind may differ from the arm's common quality, one sigma."""
 
 
 def arm_effects(problem: Problem, arm: str) -> list[Effect]:

@@ -16,7 +16,7 @@ from flangeye.types import Floats
 from flangeye.types.geometry import adjoint_shift, stack_rows
 
 LARGEST = 1e-3
-"""Standard deviation of what a part may do: [rad] or [m]."""
+"""Prior standard deviation of a part's change [rad] or [m]."""
 
 
 def blame(

@@ -46,8 +46,8 @@ CHUNK_SECONDS, MOST = 5.0, 500
 
 
 _LOGS = {"distributed.admin.low-level-log-length": 8}
-"""Dask keeps as many of the last messages on each connection, 1,000 if nothing is said: with them
-every chunk that was sent to a worker, 600 bytes a session."""
+"""Number of last messages that dask keeps for each connection, 1,000 by default. They hold every
+chunk sent to a worker, 600 bytes a session."""
 
 _LOCAL = {
     **_LOGS,

@@ -30,7 +30,7 @@ Arms = Literal["both", "first", "second"]
 """Whose poses: where there is one arm, ``both`` is that one."""
 
 FEWEST_SAMPLES = 4
-"""Samples below which every explanation fits."""
+"""Fewest samples; with fewer, any explanation fits."""
 
 
 class NotApplicable(Exception):
@@ -130,7 +130,7 @@ class RecordedSession:
         """
         self.require_samples()
         if not self.uses_poses:
-            raise NotApplicable("the camera's link is where the joint angles say")
+            raise NotApplicable("the poses of the camera's link follow from joint angles")
 
     def where(self, mask: Mask) -> RecordedSession:
         """Return the samples of a mask."""

@@ -73,8 +73,8 @@ def in_configuration(
     known = configuration.place
     if configuration.other_base and known is None and not np.isfinite(session.rotations).any():
         raise StageError(
-            "two arms and a circle whose place is not known: give its place, which for the "
-            "flange's own circle is known, or use a marker"
+            "two arms with a circle at an unknown place cannot be solved: state its place, which "
+            "is known for the flange's own circle, or use a marker"
         )
     links = seconds = None
     if LINK in configuration.camera or configuration.other_base:

@@ -64,7 +64,7 @@ def _beside(header: Header) -> Iterator[Mistake]:
     instead = ("robot", "second_robot", "configuration")
     given = [name for name in instead if name in header.model_fields_set]
     if given:
-        yield (), f"says itself what stands where; leave out {' and '.join(given)}"
+        yield (), f"states all mountings itself; leave out {' and '.join(given)}"
 
 
 def _twice(section: CellSection) -> Iterator[Mistake]:
@@ -88,7 +88,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
             link = f"; a link is written {{on: {each.on.partition('_')[0]}, link: 3}}"
             yield (
                 (group, name, "on"),
-                f"'{each.on}' is nothing that carries: write {' or '.join(carriers)}"
+                f"nothing can stand on '{each.on}': write {' or '.join(carriers)}"
                 f"{link if 'link' in each.on else ''}",
             )
     for group, name, each, _ in _on_links(section):

@@ -169,11 +169,11 @@ class TruthResult(_Part):
     """Simulation only: the calibration's true error."""
 
     base_T_camera: Matrix | None = None
-    """Where the camera is, if it stands."""
+    """The camera's true pose, if it is fixed in the base."""
     transforms: dict[str, Matrix] = Field(default_factory=dict)
-    """Every unknown, as it really is."""
+    """True value of every unknown."""
     errors: dict[str, TransformErrorResult] = Field(default_factory=dict)
-    """Error of every unknown, where its covariance is taken."""
+    """Error of every unknown, at the point about which its covariance is taken."""
     error_at_centroid: float
     """At the workspace's centre [m]."""
     rms_over_workspace: float
@@ -181,11 +181,10 @@ class TruthResult(_Part):
     rotation_error: float
     """[rad]"""
     at_work: float | None = None
-    """Where the arm is not what it reports: rms distance, at poses that took no part, between where
-    the camera says the target is and where the controller has it, the correction of the circle's
-    place applied if there is one [m]."""
+    """For an arm with errors: rms distance, at poses not used, between the target's position by the
+    camera and by the controller [m]. The correction of the circle's place is applied, if any."""
     at_work_corrected: float | None = None
-    """The same of the pose for the corrected arm, and that arm [m]."""
+    """The same for the corrected arm and the pose for it [m]."""
 
 
 class SeamTruthResult(_Part):
@@ -211,7 +210,7 @@ class SeamResult(_Part):
     covariance: list[Matrix]
     """(N, 3, 3) of the points [m^2]."""
     tube: Vector
-    """(N) with 95 % the seam is not further off than this [m]."""
+    """(N,) radius about each point within which the seam is with 95 % probability [m]."""
     half_angle: float | None = None
     """Half angle of the groove [rad]."""
     half_width: float | None = None
@@ -280,7 +279,7 @@ class AnswerResult(_Part):
     correction: CorrectionResult | None = None
     """The arm correction that these poses require."""
     arms: dict[str, CorrectionResult] = Field(default_factory=dict)
-    """The same of a cell's arms, by their names."""
+    """The same for each arm of a cell, by name."""
     expected_rms: float | None = None
     """Error to expect at the work, rms [m]."""
     holdout_rms: float | None = None
