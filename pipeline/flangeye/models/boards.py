@@ -65,6 +65,8 @@ class Board:
     def size(self) -> tuple[float, float]:
         """Width and height [m]."""
         if self.kind == "circles":
+            # OpenCV counts circles of one row, which are two squares apart, with a margin of one
+            # square.
             return (2 * self.columns + 1) * self.square, (self.rows + 1) * self.square
         return self.columns * self.square, self.rows * self.square
 
@@ -92,6 +94,8 @@ class Board:
     def place(self, from_top_left: Floats) -> Floats:
         """Return positions (N, 2), right and down from the top left corner, in ``target`` [m]."""
         width, height = self.size
+        # Print coordinates run down, ``target`` runs up, so that its z leaves the paper towards the
+        # viewer.
         x, y = from_top_left[:, 0] - width / 2, height / 2 - from_top_left[:, 1]
         return np.stack([x, y, np.zeros(len(x))], axis=1)
 

@@ -61,6 +61,7 @@ class TargetBody:
         import trimesh
 
         mesh = trimesh.Trimesh(self.vertices, self.triangles)
+        # Facets of a turned part meet at less, and would cover a drawing with lines.
         sharp = mesh.face_adjacency_angles > np.radians(30)
         ends = np.asarray(mesh.vertices[mesh.face_adjacency_edges[sharp]])
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
@@ -113,6 +114,7 @@ class ArmBody(TargetBody):
         out = {}
         for k in np.unique(self.links).tolist():
             own = np.flatnonzero(self.links == k)
+            # `own` ascends, so its index is a vertex's number within the link.
             number = np.searchsorted(own, self.triangles[self.links[self.triangles[:, 0]] == k])
             out[k] = TargetBody(f"link{k}", self.vertices[own], number.astype(np.int32))
         return out
@@ -152,6 +154,7 @@ def arm_body(robot: RobotModel | None, links: Mapping[int, str], near: Path) -> 
             f"body: {ARM} needs the meshes of {robot.model}'s links; name its URDF, "
             "robot: {urdf: arm.urdf}, with its meshes beside it"
         )
+    # Vertices of all links stand in one array: each link's triangles shift by those before.
     before = np.cumsum([0, *(len(vertices) for _, vertices, _ in parts)])
     return ArmBody(
         robot.model,
@@ -169,6 +172,7 @@ def carrying(robot: RobotModel, body: TargetBody | None) -> RobotModel:
         StageError: The space of the arm itself is not known.
     """
     if body is None or isinstance(body, ArmBody):
+        # The arm's own links are in its volumes already.
         return robot
     return robot.carrying(*fit_capsule(body.vertices))
 

@@ -67,6 +67,8 @@ def chain(frames: Mapping[str, Frame], name: str) -> list[str]:
     while name in frames:
         if name in path:
             raise StageError(f"frame '{name}' is its own parent; every frame leads to one root")
+        # A recipe from another hand may let frames stand on each other: without this check the walk
+        # to the root would never end.
         path.insert(0, name)
         name = frames[name].parent
     return path
@@ -167,6 +169,8 @@ class Cell:
     @property
     def freedoms(self) -> dict[str, Floats]:
         """Unit twists (6, k) in which each carrier can move, in its base; see ``solve_graph``."""
+        # An arm without a model may move in any way, so it is missing here and no motion is ruled
+        # out.
         able = {
             name: mover.freedoms if isinstance(mover, Axis) else _freedoms_of(mover)
             for name, mover in self.movers.items()
@@ -193,6 +197,8 @@ class Cell:
             for name, link in self.links.items()
             if link.arm in motion.joints
         }
+        # Recorded poses of other carriers win over the flange's, and computed ones over both: a
+        # rail's stream holds values, not poses.
         own = {FLANGE: motion.poses} if FLANGE in self.movers else {}
         return replace(motion, others={**own, **motion.others, **placed})
 
@@ -287,6 +293,8 @@ class Cell:
         from flangeye.maths.statistics import without_shared
 
         alone = {FLANGE: calibration.correction} if calibration.correction else {}
+        # Shared errors first: they are of the camera's measurements, which no flange correction
+        # changes.
         moved = [without_shared(o, calibration.shared) for o in observations]
         for name, correction in {**alone, **calibration.arms}.items():
             mover = self.movers[name]
@@ -322,6 +330,7 @@ def _freedoms_of(robot: RobotModel) -> Floats:
 
     arm = Arm(robot)
     # Not at zero, where axes may be parallel that are not so in general
+    # All shifts are kept: an arm of four joints still reaches along every axis of its base.
     axes = arm.axes(np.linspace(0.3, 0.7, arm.n))[0][~arm.slides]
     return np.eye(6)[:, [*_spanned(axes), True, True, True]]
 
@@ -335,6 +344,7 @@ def _freedoms_of_link(link: Link, arms: Mapping[str, RobotModel]) -> Floats:
     from flangeye.maths.kinematics import Arm
 
     arm = Arm(arms[link.arm])
+    # Three postures of which none is straight: a direction that one of them lacks, another shows.
     bent = np.multiply.outer([1.0, -1.0, 2.0], np.linspace(0.3, 0.7, arm.n))
     moves = np.concatenate(np.swapaxes(arm.jacobian(bent, link.number), 1, 2))
     return np.eye(6)[:, [*_spanned(moves[:, :3]), *_spanned(moves[:, 3:])]]
@@ -359,6 +369,7 @@ def _measured(name: str, observations: Sequence[Observation]) -> Floats:
 
 def joints_of(observation: Observation, arm: str) -> Array | None:
     """Return the (n,) joint angles of an arm at an observation [rad]; None if not recorded."""
+    # Recordings of one arm store its angles without a name.
     own = observation.joints if arm == FLANGE else None
     return observation.arm_joints.get(arm, own)
 
@@ -373,6 +384,7 @@ def cell_of(
         robot: The arm's model, where it is known.
         second: Model of a second arm that carries the target.
     """
+    # Every standard configuration is such a graph, so that solvers know one model of a cell only.
     frames = {FLANGE: Frame(BASE), CAMERA: Frame(configuration.camera)}
     movers: dict[str, RobotModel | Axis | None] = {FLANGE: robot}
     links: dict[str, Link] = {}

@@ -88,6 +88,7 @@ class Configuration:
     @property
     def equation(self) -> str:
         """The calibration's loop equation as text, unknown transforms in brackets."""
+        # Both sides end in the target: once as the camera measured it, once as the arm carries it.
         left = [_pose_of(self.camera), f"[{self.camera}_T_{CAMERA}]", f"{CAMERA}_T_{TARGET}"]
         placed = f"{self.target}_T_{TARGET}"
         right = [self.other_base and f"[{self.other_base}]", _pose_of(self.target)]

@@ -93,6 +93,8 @@ def board_seen(view: Grey) -> SeenBoard | None:
     grey = _grey(Image(view, np.eye(3)))
     if markers := _family_in(grey):
         return _board_of(*markers, grey)
+    # The search for a board of any size is slow, so the image is reduced: a board worth fitting is
+    # large in it.
     by = min(1.0, 2 * WIDTH / grey.shape[1])
     small: Grey = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA).astype(
         np.uint8
@@ -121,8 +123,10 @@ def _board_of(dictionary: str, ids: list[int], grey: Grey) -> SeenBoard:
     import cv2
 
     count = max(ids) + 1
+    # Half of a ChArUco board's squares hold a marker: the fewest rows that hold the highest id.
     sizes = [(c, next(r for r in range(count) if c * r // 2 >= count)) for c in range(3, count)]
     boards = [Board("charuco", c, r, 1.0, 0.75, dictionary) for c, r in sizes if r >= 3]
+    # Detected once for all candidate boards, which only interpolate corners between the markers.
     markers = cv2.aruco.ArucoDetector(dictionary_of(dictionary)).detectMarkers(grey)[:2]
     found = {board: len(_charuco_corners(board, grey, *markers)[1]) for board in boards}
     best = max(found, key=lambda board: found[board], default=None)
@@ -166,6 +170,7 @@ def _charuco_corners(
     import cv2
 
     print_ = charuco_of(board)
+    # Both prints of an even board are in use, and a corner has the same place on either.
     for legacy in (False, True)[: 1 + (board.rows % 2 == 0)]:
         print_.setLegacyPattern(legacy)
         corners, ids, _, markers = cv2.aruco.CharucoDetector(print_).detectBoard(
@@ -287,12 +292,15 @@ def _wrong_squares(corners: Corners, board: Board, grey: Grey) -> int:
     rows, columns = np.indices((board.rows, board.columns))
     squares = np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float64)
     middles = board.place((squares + 0.5) * board.square)
+    # A homography maps the board's plane to the image, up to lens distortion, which is far below
+    # half a square.
     to_image = cv2.findHomography(corners.points[:, :2], corners.pixels)[0]
     at = cv2.perspectiveTransform(middles[None, :, :2], to_image)[0]
     values = np.array([_value(grey, pixel) for pixel in at]).reshape(rows.shape)
     sense = np.where((rows + columns) % 2 == 0, -1.0, 1.0)
     around = np.pad(values, 1, constant_values=np.nan)
     beside = [around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:]]
+    # Percentiles, so that a highlight or a shadow on a few squares does not set the scale.
     contrast = float(np.ptp(np.percentile(values, [20, 80])))
     differs = sense * (values - np.nanmean(beside, axis=0))
     # Least contrast of a square to its neighbours: 0.3 of that between black and white
@@ -338,7 +346,10 @@ def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> F
         return rough
     # Two homogeneous lines meet in their cross product
     crossed = [np.cross(lines[i - 1], lines[i]) for i in range(4)]  # type: ignore[arg-type]
+    # Lines are straight only without distortion, so they meet there and the corner is distorted
+    # back.
     corners = _bent(np.array([c[:2] / c[2] for c in crossed]), image)
+    # A corner that moves farther than the profiles reach was found on another edge.
     near = np.linalg.norm(corners - rough, axis=1).max() < ACROSS
     return np.asarray(corners) if near else rough
 
@@ -381,6 +392,7 @@ def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> 
         if len(edges) < PROFILES / 3:
             return None
         middle = edges.mean(axis=0)
+        # Total least squares: both coordinates of an edge point have noise.
         direction = np.linalg.svd(edges - middle)[2][0]
         normal = np.array([-direction[1], direction[0]])
         # Edges farther than this from the fitted line belong to something else [px]
@@ -403,6 +415,8 @@ def _edges(grey: NDArray[np.uint8], start: Floats, along: Floats, across: Floats
     # Noise makes slopes too: only those near the steepest count.
     slope = np.where(slope > 0.25 * slope.max(axis=1, keepdims=True), slope, 0.0)
     middle = 0.5 * (steps[1:] + steps[:-1])
+    # The centroid of the slope is the edge under any symmetric blur.
     at = (slope * middle).sum(axis=1) / np.maximum(slope.sum(axis=1), 1e-9)
+    # Grey levels between black and white: less is shadow, a highlight, or no edge.
     strong = np.ptp(profiles, axis=1) > 30
     return np.asarray((start + shares[:, None] * along + at[:, None] * across)[strong])

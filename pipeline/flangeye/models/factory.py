@@ -61,6 +61,7 @@ def _from_controller(robot: RobotModel, path: Path) -> RobotModel:
     joints = [
         joint.model_copy(
             update={
+                # The controller stores differences to the nominal table, in SI units.
                 "theta": joint.theta + theta,
                 "a": joint.a + a,
                 "d": joint.d + d,
@@ -109,6 +110,7 @@ def _from_ros(robot: RobotModel, path: Path) -> RobotModel:
 
 def _in_urdf_frame(volume: Volume, robot: RobotModel) -> Volume:
     """Return a volume in the frame a URDF gives its link: before the link's own ``a, alpha``."""
+    # Capsules are given in Denavit-Hartenberg frames, the ROS file in URDF frames.
     if volume.link == 0:
         return volume
     joint = robot.joints[volume.link - 1]

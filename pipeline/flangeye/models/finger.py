@@ -89,6 +89,7 @@ class FingerGeometry(Model):
         """Tool's axes in the flange's (3, 3); the tool's z points back to the robot."""
         # The flange's z points at the work, so the tool's z is opposite, and its y for handedness
         c, s = np.cos(self.direction), np.sin(self.direction)
+        # Columns are the tool's axes in the flange.
         return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
     @property
@@ -117,6 +118,7 @@ class Finger(FingerGeometry):
         known = self.calibration
         if known is None or known.lateral is None or known.axial is None:
             return None
+        # A finger is about equally soft to all sides and much stiffer along its axis.
         stiffness = np.array([known.lateral, known.lateral, known.axial])
         return float(np.linalg.norm(stiffness * displacement))
 

@@ -180,6 +180,7 @@ class RobotModel(Model):
         try:
             volumes = self._bodies.volumes
             return self.model_copy(update={"volumes": volumes, "volumes_missing": ""})
+        # A missing mesh must not stop a run that moves nothing: the reason is kept for a plan.
         except RecipeError as error:
             return self.model_copy(update={"volumes_missing": str(error)})
 
@@ -222,6 +223,7 @@ class RobotModel(Model):
         """Sum of all offsets from base to flange [m]: no point of it is farther from the base."""
         ends = [*(joint.xyz for joint in self.joints), self.flange_frame.xyz]
         offsets = [abs(joint.a) + abs(joint.d) for joint in self.joints]
+        # The triangle inequality: links in line reach farthest.
         slides = [max(-j.lower, j.upper) for j in self.joints if j.slides]
         return float(np.linalg.norm(ends, axis=1).sum() + sum(offsets + slides)) + abs(
             self.flange_offset
@@ -243,5 +245,6 @@ def joints_in_order(names: Iterable[str]) -> tuple[str, ...]:
         return tuple(ur)
     # Names such as arm2_joint4: the joint's number is the last one
     numbers = {name: [int(n) for n in re.findall(r"\d+", name)] for name in named}
+    # Other arms than six- and seven-joint ones have no common naming, so nothing is guessed.
     numbered = sorted((n for n in named if numbers[n]), key=lambda n: numbers[n][::-1])
     return tuple(numbered) if len(numbered) in (6, 7) else ()

@@ -80,6 +80,7 @@ def flange_of(details: FlangeDetails, standard: FlangeStandard) -> Flange:
     holes = tuple((pin or 0.0) + pi / n + 2 * pi * i / n for i in range(n))
     return Flange(
         name=standard.designation,
+        # The plane fit sees the flat face only, which ends where the chamfer begins.
         rim=standard.outer / 2 - details.rim_chamfer,
         outer=standard.outer / 2,
         bore=standard.centring / 2 + details.bore_chamfer,
@@ -218,6 +219,7 @@ def match_holes(flat: Floats, flange: Flange) -> HoleMatch | None:
     """
     if not flange.holes:
         return None
+    # A ring half as wide as the holes: wider, the face beside a hole would fill it.
     empty = emptiness(flat, flange.pitch, 0.5 * flange.hole)
     if empty is None:
         return None
@@ -242,6 +244,7 @@ def roll_angle(flat: Floats, flange: Flange) -> float | None:
         flange: Whose pattern to look for.
     """
     match = match_holes(flat, flange) if flange.pin is not None else None
+    # On the published clouds the next best rotation scores below 0.9 of the right one.
     if match is None or match.score < 0.5 or match.rival > 0.9 * match.score:
         return None
     return match.angle
@@ -258,6 +261,7 @@ def emptiness(flat: Floats, pitch: float, half_width: float) -> Floats | None:
     Returns:
         (TICKS,), or None when there are too few points to see a hole.
     """
+    # Counted by angle: the face fills every tick of the ring but those over a hole.
     x, y = flat.T.compress(np.abs(distances(flat) - pitch) < half_width, axis=1)
     turn = np.arctan2(y, x) / (2 * np.pi) * TICKS
     count = np.bincount(np.floor(turn).astype(np.intp) % TICKS, minlength=TICKS).astype(float)
@@ -289,6 +293,7 @@ def _openings(flange: Flange) -> list[tuple[float, float]]:
     for recess in flange.details.recesses:
         across = (recess.width / 2) ** 2 - (flange.pitch - recess.radius) ** 2
         if across > 0:
+            # The round end of the slot adds half a chord at the height of the pitch circle.
             openings.append((recess.angle, recess.half_span + np.sqrt(across) / recess.radius))
     return openings
 
@@ -306,9 +311,12 @@ def _vertex(scores: Floats, best: int) -> float:
     """Return how far from ``best`` the peak's centre of mass lies, in ticks."""
     near = np.arange(-6, 7)
     height = scores[(best + near) % len(scores)]
+    # A centre of mass: the correlation of holes with hard edges has a triangular peak, which a
+    # parabola fits badly.
     height = np.clip(height - height.min(), 0.0, None)
     return float(near @ height / height.sum()) if height.sum() > 0 else 0.0
 
 
 def _wrap(angle: Floats | float) -> Floats:
+    # Into (-pi, pi]: half a turn is always +pi
     return np.asarray(np.pi - (np.pi - angle) % (2 * np.pi))

@@ -54,6 +54,8 @@ class Urdf:
         """Return the joints from the root to a link."""
         joints: list[ET.Element] = []
         while link in self.above:
+            # A damaged file may close its chain to a ring; a chain cannot have more joints than
+            # links.
             joints.append(self.above[link])
             link = end_of(joints[-1], "parent")
             if len(joints) > len(self.links):
@@ -124,6 +126,7 @@ def arm_of(
         raise RecipeError(f"{path}: base '{base}' moves against the arm; name a link before it")
     # The controller's base may be a side branch, as ROS-Industrial's `base` is: the arm's chain
     # begins where the two part
+    # `root` is the last common link of both chains.
     base_T_root = invert(_fixed(path, to_base[shared:]))
     try:
         robot = _assemble(urdf, base_T_root, to_flange[shared:], standard)
@@ -207,6 +210,8 @@ class UrdfBodies:
         for link, index, pose in self.links():
             of = self.urdf.links[link]
             rough = of.find("collision/geometry/mesh") is not None
+            # Primitive collision shapes (boxes, cylinders) show no arm: then the visual meshes are
+            # better.
             first, second = ("collision", "visual") if rough else ("visual", "collision")
             for body in of.findall(first) or of.findall(second):
                 geometry = body.find("geometry")
@@ -256,6 +261,8 @@ def _assemble(
 ) -> RobotModel:
     joints: list[Joint] = []
     before = base_T_first  # from the last moving link, or the base, to the link that is reached
+    # The same walk as in UrdfBodies.links: poses start anew at each moving joint, whose motion
+    # comes between.
     for joint in chain:
         # Fixed joints on the way become part of the next moving joint's origin
         before = before @ origin_of(urdf.path, joint)
@@ -280,6 +287,7 @@ def _assemble(
 def _joint_speed(path: Path, chain: Iterable[ET.Element]) -> dict[str, SI]:
     """Return the speed of the slowest joint that turns [rad/s], where the file has any."""
     limits = [joint.find("limit") for joint in chain if joint.get("type") in TURNS]
+    # Continuous joints are often written with an infinite speed, which says nothing.
     bounded = [limit for limit in limits if limit is not None and limit.get("velocity") != "inf"]
     told = [numbers_of(path, limit, "velocity", "0", 1)[0] for limit in bounded]
     speeds = [speed for speed in told if speed > 0]
@@ -329,6 +337,7 @@ def _sideways(urdf: Urdf, robot: RobotModel, flange: str) -> Warn | None:
     joint, end = robot.joints[-1], robot.link_T_flange
     axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
     # How far the flange is along the axis from the joint before shows which way is outwards.
+    # An axis has no sense of its own: joints are drawn turning either way about it.
     along = axis @ (rotation_from_rpy(*joint.rpy).T @ np.asarray(joint.xyz) + end[:3, 3])
     seen = end[:3, :3].T @ axis * (-1.0 if along < 0 else 1.0)
     known = abs(along) > 1e-3

@@ -76,6 +76,7 @@ def mesh_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Any:
 def _points(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Floats:
     if body.tag == "box":
         half = np.array(numbers_of(urdf, body, "size", "")) / 2
+        # A capsule around the corners holds the whole box, which is convex.
         return np.asarray(half * np.array(list(itertools.product((-1, 1), repeat=3))))
     if body.tag == "cylinder":
         return _cylinder(_number(body, "radius", urdf), _number(body, "length", urdf))
@@ -105,6 +106,8 @@ def _find(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
             return path
         raise MissingMesh(f"{urdf}: mesh '{_short(name)}' is not at {_short(str(path))}")
     package, _, below = name.removeprefix("package://").partition("/")
+    # Without ROS nobody resolves package names: URDFs are then usually in a folder of their
+    # package, or beside it.
     folders = [packages[package]] if package in packages else _nearby(urdf, package)
     for folder in folders:
         if _is_file(folder / below):
@@ -152,6 +155,8 @@ def _loaded(path: Path) -> Any:
     meshes = (".stl", ".obj", ".dae", ".ply")
     if kind not in meshes:
         raise RecipeError(f"{path}: '{kind}' is not a mesh format; known: {', '.join(meshes)}")
+    # Decoded from memory: OBJ and DAE may name further files, which a recipe from elsewhere must
+    # not open.
     raw = read_regular(path, 200_000_000, RecipeError)
     if kind == ".dae" and (b"<!DOCTYPE" in raw or b"<!ENTITY" in raw):
         raise RecipeError(f"{path}: declares a document type or entities, which are not read")
@@ -207,6 +212,7 @@ class Capsule(NamedTuple):
     def distance(self, points: Floats) -> Floats:
         """Return how far (N, 3) points lie outside, (N,); negative inside [m]."""
         along = self.end - self.start
+        # The tiny number keeps a capsule of no length, a sphere, from dividing by zero.
         share = (points - self.start) @ along / max(float(along @ along), 1e-300)
         nearest = self.start + np.clip(share, 0, 1)[:, None] * along
         return np.asarray(np.linalg.norm(points - nearest, axis=1) - self.radius)
@@ -238,6 +244,7 @@ def _along(points: Floats, direction: Floats) -> Capsule:
     # A round end reaches beyond the segment's by this much at each point's distance.
     beyond = np.sqrt(np.maximum(radius**2 - off**2, 0.0))
     low, high = (local[:, 2] + beyond).min(), (local[:, 2] - beyond).max()
+    # A body wider than long needs no segment: a sphere about its middle
     if low > high:
         low = high = (local[:, 2].min() + local[:, 2].max()) / 2
         radius = float(np.hypot(off, local[:, 2] - low).max())

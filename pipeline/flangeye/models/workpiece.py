@@ -137,6 +137,7 @@ def load_workpiece(path: Path) -> Workpiece:
     vertices, triangles = read_mesh(path.parent / file.cad)
     vertices = vertices * scale
     seams = {line.name: _seam(path, line, scale) for line in file.seams}
+    # Names became keys: equal ones have overwritten each other.
     if len(seams) < len(file.seams):
         raise StageError(f"{path}: two seams have one name")
     for name, seam in seams.items():
@@ -199,6 +200,8 @@ def _seam(path: Path, line: SeamLine, scale: float) -> CadSeam:
 def _check_on_part(path: Path, name: str, seam: CadSeam, vertices: Floats) -> None:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     outside = np.maximum(np.maximum(low - seam.points, seam.points - high), 0.0)
+    # Catches millimetres read as metres and seams of another revision; a root may lie a little
+    # outside.
     off = float(np.linalg.norm(outside, axis=1).max())
     # A seam may be this far outside the CAD's box, as a share of its diagonal
     if off > 0.1 * np.linalg.norm(high - low):

@@ -64,9 +64,13 @@ def coverage_of(box: Box, poses: Iterable[Floats]) -> Coverage:
     places = np.zeros((cells,) * 3, np.intp)
     if not len(found):
         return Coverage(places, np.zeros((3, 2)))
+    # 0 to 1 across the box; a flat box has one layer of cells.
     within = (found[:, :3, 3] - box.centre) / np.maximum(box.size, 1e-9) + 0.5
     np.add.at(places, tuple(np.clip((within * cells).astype(np.intp), 0, cells - 1).T), 1)
+    # The arithmetic mean of rotation matrices, made orthonormal, is the chordal mean (Hartley et
+    # al. 2013).
     mean = nearest_rotation(found[:, :3, :3].mean(axis=0))
+    # From the left: in axes of the base, in which the text names them
     turns = rotation_log(found[:, :3, :3] @ mean.T)
     return Coverage(places, np.column_stack([-turns.min(axis=0), turns.max(axis=0)]).clip(0.0))
 
