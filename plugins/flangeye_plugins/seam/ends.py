@@ -30,12 +30,14 @@ def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.
     if not len(way):
         return np.zeros(0, dtype=np.intp), np.zeros(0)
     lane = np.floor(lanes / pitch).astype(int)
+    # By lane, then along it: each lane's last entry is its last point.
     order = np.lexsort((way, lane))
     last = np.append(np.diff(lane[order]) != 0, True)
     first = np.append(True, last[:-1])
     spans = way[order[last]] - way[order[first]]
     counts = np.diff(np.append(-1, np.flatnonzero(last)))
     gaps = spans / np.maximum(counts - 1, 1)
+    # With fewer points a lane's spacing, and half of it, is not known.
     full = counts >= 4
     return order[last][full], gaps[full] / 2
 
@@ -53,6 +55,7 @@ def face_ends(
         on = _on_face(section, q, face, tolerance) & (np.abs(away) < 8 * tolerance)
         on &= (active == face) | (active == edge)
         beside = q[on] @ section.normals[edge] - section.heights[edge]
+        # Farther in on the plate nothing shows its edge; far beyond the edge is another part.
         near = (beside > -SEAM_WITHIN) & (beside < SEAM_WITHIN / 2)
         if near.sum() < 4 * FEWEST_LANES:
             continue
@@ -137,6 +140,7 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
     if not ends:
         return limit, np.inf
     sharp = [end for end in ends if end.sharp]
+    # An end before visible background is sure; a blurred or hidden one may go on.
     certain = [end for end in sharp if end.seen] or sharp or ends
     first = min(certain, key=lambda end: end.place)
     same = [first]
@@ -144,6 +148,7 @@ def soonest(ends: list[End], limit: float) -> tuple[float, float]:
         near = 3 * np.hypot(first.deviation, end.deviation)
         if end is not first and end.sharp and end.place - first.place <= near:
             same.append(end)
+    # Inverse-variance weights; a floor of 1 um keeps exact ends finite.
     weights = np.array([max(end.deviation, 1e-6) ** -2 for end in same])
     place = float(weights @ [end.place for end in same] / weights.sum())
     # Uniform distribution over the hidden stretch: standard deviation length / sqrt(12)
@@ -192,6 +197,8 @@ class Rays:
             # The measurements within one pixel of a ray are what the scanner sees on it.
             near = off < pitch / away[:, None]
             behind = far[np.minimum(at, len(far) - 1)] - away[:, None]
+            # Past only if every measurement on the ray lies behind: one nearer may be the surface
+            # itself.
             out |= near.any(axis=1) & ((behind > tolerance) | ~near).all(axis=1)
             covered |= (near & (behind < -tolerance)).any(axis=1)
         return out, covered & ~out

@@ -177,6 +177,8 @@ def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Curve:
 
 def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> Found:
     """Return the fitted joint with its ends."""
+    # The seam may be off by `reach`, and its faces are fitted over WIDE; 10 mm are for the line's
+    # bends.
     box = params.reach + WIDE + 10e-3
     points = seen.points
     at, local = rough.local(points, box)
@@ -192,6 +194,7 @@ def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> Found:
     # smooth line through where it was found, which has none.
     line = rough.through(_placed(rough, local, normals[at], params))
     at, local = line.local(points, box)
+    # The fit is local: it starts from the places that the search found.
     swept = swept_from(_placed(line, local, normals[at], params), line.length, line.closed)
     rays = Rays(seen.eyes, seen.clouds, line.points)
     found = Found(line, swept, local, pitch, rays, (0.0, line.length))
@@ -279,6 +282,7 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
         end = surface_end(sign * at[:, 0] + more, past, covered, pitch)
         ends += [] if end is None else [end]
     limit = found.course.length if sign > 0 else 0.0
+    # Two pixels short of the course's end the scan was cut, not the plate.
     place, deviation = soonest(ends, sign * limit - 2 * pitch)
     if np.isinf(deviation):
         return limit, deviation
@@ -305,6 +309,8 @@ def _line(found: Found) -> tuple[Floats, Floats, Floats]:
     covariance = np.einsum("nai,nab,nbj->nij", axes[:, 1:], across, axes[:, 1:])
     for k, deviation in zip((0, -1), found.deviations, strict=True):
         if np.isfinite(deviation):
+            # Only the two ends are uncertain along the seam: elsewhere a shift along a line is no
+            # error.
             covariance[k] += deviation**2 * np.outer(axes[k, 0], axes[k, 0])
     return line, openings, covariance
 
@@ -343,6 +349,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
         if not value <= limit:
             told = what.format(f"{value * 1e3:.3g} mm")
             raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm{name}")
+    # Before the angles: on a single plane any joint's angles fit somehow.
     _refuse_plane(found)
     leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(JOINTS[params.joint].spread)
     if leaning.max() > 0:
@@ -421,6 +428,7 @@ def _shares(found: Found) -> tuple[float, float, tuple[float, float] | None]:
     counts = [np.histogram(local[on, 0], cells)[0] for on in groups]
     seen = np.all(np.array(counts) >= 4, axis=0)
     every, good = (np.histogram(local[which, 0], cells)[0] for which in (near, on_joint))
+    # A stretch on another joint or part: the seam would leave the workpiece there.
     off = _longest_run((every >= 20) & (good < every / 2))
     # A crossing seam, or a clamp, is shorter [m]
     short = 20e-3

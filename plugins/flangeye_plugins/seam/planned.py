@@ -98,6 +98,7 @@ def _above(points: Floats, openings: Floats, x: Floats, tool: float) -> Floats:
     """Return flange poses (N, 4, 4) with the tool along each opening and x close to ``x``."""
     # Turns about the tool are free: the one nearest to where the arm was calibrated is taken
     z = -openings / np.linalg.norm(openings, axis=1, keepdims=True)
+    # Gram-Schmidt: the wanted x, made square to the tool's axis
     along = x - (z @ x)[:, None] * z
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (len(points), 1, 1))

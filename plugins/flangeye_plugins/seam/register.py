@@ -71,6 +71,7 @@ def register(
         CalibrationRefused: The fit is poor or ambiguous.
     """
     check_unit(points, workpiece)
+    # Measured points lie before the scanner; others are invalid.
     scan = points[points[:, 2] > 0.0].astype(np.float32)
     looks = Looks(workpiece.vertices, workpiece.triangles)
     search = BodySearch(scan, looks)
@@ -96,6 +97,7 @@ def register(
     beside = search.refuted(fit.pose, lambda at: distances_to_line(at, seam.points) < reach)
     _refuse_missing(workpiece, "the seam", beside, limits)
     second = 0.0
+    # Candidates are sorted: the first one with another seam is the strongest rival.
     for other in found[1:]:
         apart = _seam_apart(seam, invert(fit.pose) @ other.pose, looks.size)
         if apart > SAME:

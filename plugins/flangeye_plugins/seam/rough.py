@@ -59,6 +59,7 @@ def rough_path(
     spots: list[list[JointPlace]] = []
     for k in range(slabs.max() + 1):
         at = order[bounds[k] : bounds[k + 1]]
+        # Some 700 points show the lines as well as all do, and bound the time for a slab.
         at = at[:: max(1, len(at) // 700)]
         q, normal = local[at, 1:3], normals[at]
         lines = list(_lines(q, normal, tolerance))
@@ -74,6 +75,7 @@ def rough_path(
 def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
     """Yield the lines with most points, each found from hypotheses of a point and its normal."""
     flat = normals[:, 1:]
+    # Surfaces that face along the seam, such as clamps, show no line in a section.
     size = np.linalg.norm(flat, axis=1)
     q, flat = q[size > 0.8], flat[size > 0.8] / size[size > 0.8, None]
     alike = np.cos(np.radians(25))
@@ -175,6 +177,7 @@ def _placed(
     )
     lengths = np.zeros(3)
     lengths[heights] = solved[2:]
+    # Plates cannot overlap, and a butt joint needs a gap that is seen.
     if not (lengths >= -tolerance).all() or (joint.gap and lengths[2] < 2 * tolerance / 3):
         return None
     section = Section(joint, np.concatenate([angles, np.maximum(lengths, 0.0)]))
@@ -206,6 +209,7 @@ def explained(section: Section, q: Floats, tolerance: float) -> float | None:
     of = int(near.sum())
     if counts[needed].min() < max(12, 0.04 * of):
         return None
+    # From -1 to 1: each unexplained point costs what an explained one gains.
     return float(2 * good.sum() / max(of, 1) - 1)
 
 
@@ -235,6 +239,7 @@ def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
             ),
             default=(0.0, None),
         )
+        # A path may begin anywhere: a negative past is dropped.
         best.append((place.score + max(score, 0.0), before if score > 0 else None))
     ways: list[list[JointPlace]] = []
     used: set[int] = set()

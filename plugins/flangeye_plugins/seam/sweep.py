@@ -52,6 +52,7 @@ class Sweep:
 def swept_from(places: list[JointPlace], length: float, closed: bool) -> Sweep:
     """Return the start of the fit from places along the line."""
     s = np.array([p.s for p in places])
+    # Unwrapped, or a roll near half a turn would make the spline swing through zero.
     values = np.column_stack([[p.q for p in places], np.unwrap([p.roll for p in places])])
     shape = np.median([p.shape for p in places], axis=0)
     spline = Spline.through(length, closed, s, values)
@@ -98,6 +99,7 @@ def _step(
     which[first:] = edges
     normals = swept.section.normals[edges]
     residual[first:] = np.einsum("ni,ni->n", normals, q[first:]) - swept.section.heights[edges]
+    # An end lies anywhere within a spacing: half of it bounds the error, whatever the scan's noise.
     size = np.where(np.arange(len(points)) < first, sigma, 0.5 * pitch)
     tukey = 4.685  # Tukey's constant: 95 % efficiency for normal noise
     weight = np.maximum(1 - (residual / (tukey * size)) ** 2, 0.0) ** 2
@@ -140,6 +142,7 @@ def _design(swept: Sweep, basis: Any, line: Floats, q: Floats, which: Any) -> An
     ways = (-np.sin(turned), -np.cos(turned), lever)
     shape = np.zeros((len(q), 7))
     shape[np.arange(len(q)), which] = lever
+    # Heights of faces and the gap move a half-plane along its own normal.
     shape[:, 4:] = -OFFSETS[which]
     free = swept.section.joint.free
     return sparse.hstack(
@@ -159,6 +162,8 @@ def _prior(swept: Sweep) -> tuple[Floats, Floats]:
     bend = np.array([1e-3, 1e-3, 0.05])
     for k in range(3):
         at = slice(k * m, (k + 1) * m)
+        # Second differences: a straight line costs nothing. The tiny identity keeps stretches
+        # without points solvable.
         normal[at, at] = bends.T @ bends / bend[k] ** 2 + 1e-6 * np.eye(m)
         present[at] = values[:, k]
     spread = np.concatenate([np.radians(joint.spread), np.ones(3)])[free]
@@ -172,6 +177,7 @@ def _moved(swept: Sweep, step: Floats) -> Sweep:
     m = len(values)
     shape = swept.section.shape.copy()
     shape[joint.free] += step[3 * m :]
+    # A negative gap or height would turn the joint inside out.
     shape[4:] = np.maximum(shape[4:], 0.0)
     spline = replace(swept.spline, values=values + step[: 3 * m].reshape(3, m).T)
     return replace(swept, spline=spline, section=Section(joint, shape))
@@ -181,5 +187,6 @@ def _shared(s: Floats, which: Any, scores: Floats) -> float:
     """Return the factor by which correlated errors of neighbouring points raise the variance."""
     # Length along the seam within which errors may be correlated [m]
     blocks = (s / 5e-3).astype(int) * 4 + which
+    # If errors were independent, the squared sums would equal the sum of squares.
     sums = np.bincount(blocks, scores)
     return max(float((sums**2).sum() / max((scores**2).sum(), 1e-300)), 1.0)

@@ -139,6 +139,7 @@ def improve_pool(
 
 def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None:
     """Replace the pose whose exchange for the newcomer reduces the cost most (lines 6 to 15)."""
+    # The newcomer in place of each pose in turn: N candidate pools
     pools = [[*search.pool[:i], *search.pool[i + 1 :], newcomer] for i in range(len(search.pool))]
     costs = [_cost(pool, evaluate) for pool in pools]
     best = int(np.argmin(costs))
@@ -163,6 +164,7 @@ def _cost(pool: Sequence[Observation], evaluate: Evaluate) -> float:
 
 def solve_pool(pool: Sequence[Observation]) -> Transform:
     """Return ``base_T_camera`` from a pool by equations (8) to (10)."""
+    # A rigid registration of camera points to base points is base_T_camera itself.
     return Transform(BASE, CAMERA, rigid(*kabsch(centres_of(pool), tcps_of(pool))))
 
 

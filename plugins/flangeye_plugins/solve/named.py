@@ -263,6 +263,7 @@ def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
     pulled = list(observations)
     check_poses(pulled)
     rotation, translation = kabsch(centres_of(pulled), tcps_of(pulled))
+    # A flange's centre is its origin, so the TCPs are the target points.
     residuals = residuals_of(pulled, rotation, translation)
     _require_observable(tcps_of(pulled), residuals, params.rotation_limit)
     estimate = least_squares_estimate(rotation, translation, tcps_of(pulled), residuals)

@@ -45,6 +45,7 @@ def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
     sightings = stored.sightings(seen, np.zeros(len(seen), dtype=np.intp))
     test = DriftTest(false_alarms=params.false_alarms, limit=params.limit)
     told = information_of(sightings, test.daily)
+    # One check at once: the earlier calibration is the only prior.
     found = verdict(told, stored.prior, stored.corners, test)
     shift = f"{found.shift * 1e3:.2f} mm at the work's worst corner"
     figures = {

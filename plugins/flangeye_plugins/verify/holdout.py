@@ -100,8 +100,11 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     used = np.array([pair.used for pair in calibration.pairs])
     held = hold_out(poses, deals, [each.as_reported() for each in solved], standing)
     norms = np.linalg.norm(held.errors, axis=1)
+    # A pose that the solver set aside but predicts well is no outlier: counting it keeps the error
+    # honest.
     counted = used | (norms <= params.max_rms)
     figures = {"folds": float(len(deals)), "limit": params.max_rms, **_figures(held, counted)}
+    # The same folds and the same poses, so that both answers can be compared.
     if calibration.as_corrected():
         answers = [each.as_corrected() or each.as_reported() for each in solved]
         corrected = _figures(hold_out(poses, deals, answers, standing), counted)
@@ -120,6 +123,7 @@ def deal(count: int, folds: int, seed: int) -> list[Indices]:
     """
     order = np.random.default_rng(seed).permutation(count)
     folds = min(folds, count)
+    # Dealt like cards: folds differ by one pose at most.
     return [np.sort(order[fold::folds]) for fold in range(folds)]
 
 
@@ -131,6 +135,7 @@ def deal_moments(observations: Sequence[Observation], folds: int, seed: int) -> 
     moments: dict[bytes, list[int]] = {}
     for i, o in enumerate(observations):
         poses = [o.poses[name].matrix for name in sorted(o.poses)]
+        # Equal to the last bit: observations of one moment carry the same reported poses.
         moments.setdefault(np.array(poses).tobytes(), []).append(i)
     groups = list(moments.values())
     dealt = deal(len(groups), folds, seed)
@@ -145,6 +150,7 @@ def solve_without(calibration: HandEye, solve: Solver, folds: Sequence[Indices])
         CalibrationRefused: The poses outside a fold give no acceptable result.
     """
     poses = [pair.observation for pair in calibration.pairs]
+    # Removing poses in closed form keeps the estimated variances, and costs no new search.
     if without := calibration.without or solve(poses).without:  # a log does not hold it
         return [without(fold) for fold in folds]
     kept = [np.setdiff1d(np.arange(len(poses)), fold) for fold in folds]
@@ -166,6 +172,7 @@ def hold_out(
         ends = cell.ends(transforms, poses)
         mapped, expected = mapped_and_expected(ends, poses)
         held.errors[fold] = mapped - expected
+        # Expected camera_R_target
         turns = invert(ends.camera)[:, :3, :3] @ ends.target[:, :3, :3]
         held.tilts[fold] = _tilts([o.feature for o in poses], turns)
     return held
@@ -183,6 +190,7 @@ def _tilts(features: Sequence[Feature], turns: Floats) -> Floats:
         for each in features
         if not isinstance(each, PoseFeature)
     ]
+    # A circle has no orientation about its normal, so the normals are compared.
     out[~whole] = angle_between(np.reshape(axes, (-1, 3)), turns[~whole, :, 2])
     return out
 
@@ -227,6 +235,8 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
     )
     near, far = (float(np.linalg.norm(each.translation)) for each in (carried, standing))
     readings = meant(pairs, near, far, next(iter(cell.arms.values()), None))
+    # Inverted poses fit exactly as well as right ones, so no residual shows them: only the
+    # distances of camera and target from what carries them do.
     if Reading() not in readings:
         return (
             f"{carried.child} would be {near:.2f} m from the flange, and {standing.child} "
@@ -244,6 +254,7 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
 
 def _judge(figures: dict[str, float], params: HoldoutParams) -> tuple[bool, str]:
     outliers, poses = int(figures["outliers"]), int(figures["poses"])
+    # Before the error: with most poses set aside the rest may well agree, on a wrong answer.
     if outliers > params.max_outliers * poses:
         return False, (
             f"{outliers} of {poses} poses are outliers, limit {params.max_outliers:.0%}: "
@@ -253,6 +264,7 @@ def _judge(figures: dict[str, float], params: HoldoutParams) -> tuple[bool, str]
     aside = f" ({outliers} of {poses} poses set aside)" if outliers else ""
     sign = "within" if passed else "above"
     told = f"held-out error {figures['rms'] * 1e3:.3f} mm rms"
+    # Positions alone can fit with orientations read in a wrong convention.
     if passed and tilt > params.max_tilt:
         return False, (
             f"the measured orientations are off by {np.degrees(tilt):.1f} deg rms on poses held "

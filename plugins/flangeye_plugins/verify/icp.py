@@ -102,6 +102,8 @@ def verify_icp(
     surface = shape_of(flange, params)
     transform = calibration.base_T_camera.transform
     arm, correction = Arm(robot) if robot else None, calibration.as_reported().correction
+    # The circle's place on the flange is corrected, as the robot's program will have it corrected
+    # too.
     expected = [corrected_view(view, correction, arm) for view in require_views(views)]
     found = {view.id: compare(transform, view, surface, params) for view in expected}
     failed = [f"view {view}: {why}" for view, why in found.items() if isinstance(why, str)]
@@ -150,6 +152,7 @@ def compare(
     if isinstance(found, str):
         return found
     predicted = camera_T_flange.matrix
+    # From a motion in the flange's axes to the same motion in the camera's
     motion = predicted @ found.motion @ np.linalg.inv(predicted)
     return ViewComparison(PoseError(motion, predicted[:3, 3], base_T_camera.rotation), found)
 
@@ -157,6 +160,7 @@ def compare(
 def _judge(compared: Mapping[str, ViewComparison], params: IcpParams) -> Verification:
     figures = {view: _figures(comparison) for view, comparison in compared.items()}
     errors = {view: found["translation"] for view, found in figures.items()}
+    # The worst view and not the mean: the error of a matrix grows with the distance between views.
     worst = max(errors, key=lambda view: errors[view])
     tilt = max(found["tilt"] for found in figures.values())
     passed = errors[worst] <= params.max_translation and tilt <= params.max_tilt

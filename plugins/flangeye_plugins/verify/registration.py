@@ -135,6 +135,7 @@ def _normals(points: Floats, neighbours: int = 12) -> Floats:
     """Return unit normals (N, 3): the direction of least variance around each point."""
     from scipy.spatial import cKDTree
 
+    # A dozen neighbours average the CAD cloud's rounding and stay on one face of a plate.
     near = points[cKDTree(points).query(points, k=neighbours)[1]]
     centred = near - near.mean(axis=1, keepdims=True)
     return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0])
@@ -182,8 +183,10 @@ def register(
         reach: First limit: largest error of the calibration [m].
         distance: Last limit, given by noise and other objects [m].
     """
+    # 6,000 points suffice: the error of the motion falls with the square root of their number.
     source = measured[:: 1 + len(measured) // 6000]
     motion = np.eye(4)
+    # Coarse to fine: a tight limit at the start would lose a plate that is off by more.
     for limit in _limits(reach, distance):
         still = STILL if limit == distance else 20 * STILL
         converged = _converge(source, surface, motion, limit, still)
@@ -223,7 +226,10 @@ def _equations(
     matched = np.isfinite(gap)
     moved, nearest = moved[matched], nearest[matched]
     normals = surface.normals[nearest]
+    # Along the normal alone: points may slide on a plane, so this takes far fewer iterations than
+    # point to point.
     distances = np.einsum("ni,ni->n", normals, moved - surface.points[nearest])
+    # d/dphi of n . (phi x p) is p x n
     return np.hstack([np.cross(moved, normals), normals]), distances
 
 
@@ -237,6 +243,7 @@ def _least_squares(jacobian: Floats, distances: Floats) -> tuple[Floats, Floats]
     # near edges fake 1 % on a plate without holes
     known = values > 1e-3
     gradient = vectors[:, known].T @ (scaled.T @ distances / len(distances))
+    # Only along determined directions: noise would turn a round plate about its axis for ever.
     step = -vectors[:, known] @ (gradient / values[known])
     return step / scale, np.asarray(vectors[:, ~known].T)
 
@@ -244,6 +251,7 @@ def _least_squares(jacobian: Floats, distances: Floats) -> tuple[Floats, Floats]
 def _judge(
     source: Floats, surface: SampledSurface, motion: Floats, unknown: Floats, distance: float
 ) -> Registration | str:
+    # The third number is the rotation about z, the plate's axis.
     about_axis = unknown[:, 2] ** 2
     if len(unknown) > 1 or (about_axis < 0.5).any():
         return "the matched points are too flat to show a shift along the face"

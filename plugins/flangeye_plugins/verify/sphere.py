@@ -64,6 +64,7 @@ def verify_sphere(
     if params.bars:
         measured, lengths = _of_bars(params.bars)
     else:
+        # A distance is the same in every frame: the hand-eye matrix drops out.
         measured, lengths = _of_poses(calibration, params, Arm(robot) if robot else None)
     figures = _figures(measured - lengths, measured, lengths)
     if stage_log:
@@ -81,6 +82,7 @@ def verify_sphere(
 
 def _of_bars(bars: Sequence[BallBar]) -> tuple[Floats, Floats]:
     """Return measured and known distances (N,) of ball bars [m]."""
+    # Both balls in one scan, so that the arm has no part in it.
     seen = np.array([bar.first for bar in bars]) - np.array([bar.second for bar in bars])
     return np.linalg.norm(seen, axis=1), np.array([bar.length for bar in bars])
 
@@ -98,6 +100,7 @@ def _of_poses(
     driven = _driven(calibration, arm)
     first, second = np.triu_indices(len(used), 1)
     lengths = np.linalg.norm(driven[first] - driven[second], axis=1)
+    # Over short distances the noise of two centres hides an error of scale.
     apart = lengths >= params.shortest
     # Pairs of the arm's poses: the 95 % quantile of fewer is their largest.
     fewest_pairs = 10

@@ -57,6 +57,7 @@ def verify_stitch(
     seen = spread[np.isfinite(spread)]
     if not len(seen):
         raise StageError("verify.stitch: no place of the flange was seen in two views")
+    # Medians, as half a rim that is not seen would pull a mean aside.
     middles = np.array([np.median(cloud[:, :2], axis=0) for cloud in clouds])
     slides = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
     figures = {
@@ -90,6 +91,7 @@ def _in_flange(calibration: HandEye, views: Views, arm: Arm | None) -> list[Floa
 
 def _spread(clouds: list[Floats], fewest: int) -> Floats:
     """Return the standard deviation of heights between views (CELLS, CELLS); NaN if unseen."""
+    # Without the last stray points, which would leave few cells for the plate itself.
     reach = max(float(np.quantile(np.linalg.norm(c[:, :2], axis=1), 0.98)) for c in clouds)
     heights = np.stack([_heights(cloud, reach, fewest) for cloud in clouds])
     seen = np.isfinite(heights)
@@ -97,6 +99,7 @@ def _spread(clouds: list[Floats], fewest: int) -> Floats:
     filled = np.where(seen, heights, 0.0)
     mean = filled.sum(axis=0) / np.maximum(count, 1)
     squares = np.where(seen, (heights - mean) ** 2, 0.0).sum(axis=0)
+    # Unbiased variance of few views; a place seen once says nothing about agreement.
     return np.where(count >= 2, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
 
 

@@ -52,6 +52,7 @@ def verify_touch(
     estimate = calibration.base_T_camera
     predicted = estimate.transform.apply(np.array([t.seen for t in params.touches]))
     errors = predicted - np.array([_touched(t, params.tip) for t in params.touches])
+    # At each point: a rotation error grows with its distance from where the calibration is best.
     known = covariance_at(estimate.covariance, estimate.about, predicted)
     # One coordinate of jogging to a point by eye: 0.2 mm
     known += 0.2e-3**2 * np.eye(3)
