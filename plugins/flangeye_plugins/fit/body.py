@@ -135,10 +135,9 @@ def _unlike(
     if fit.odd > chi2_quantile(0.99, len(fit.lost) + 1):
         low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
         return Rejected(
-            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}; they "
-            "differ more from side to side than a scanner's edge loss: the fit used edges of "
-            "another object, or the mesh is of another body; scan from where more of its ends are "
-            "seen"
+            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}, more "
+            "unlike than a scanner's edge loss: the fit used edges of another object, or the mesh "
+            "is another body's; scan from where more of its ends are seen"
         )
     larger, unsure = fit.oversize, fit.unsure(params.model_error, distortion)
     if (larger / unsure) ** 2 > chi2_quantile(0.99, 1):

@@ -165,9 +165,8 @@ def check_seam(seam: Seam, surface: WorkSurface, distance: float, settings: Foll
     fault = float(tube_radii(seam)[0])
     if fault > settings.reach:
         raise StageError(
-            f"weld.tactile: the plan's start is uncertain by {fault * 1e3:.1f} mm, and the groove "
-            f"is sought within {settings.reach * 1e3:.1f} mm; plan it more accurately, or raise "
-            "'reach'"
+            f"weld.tactile: the plan's start is uncertain by {fault * 1e3:.1f} mm, the groove is "
+            f"sought within {settings.reach * 1e3:.1f} mm; plan it better, or raise 'reach'"
         )
 
 

@@ -108,6 +108,7 @@ class WorkSurface:
         along = arc_lengths(self.points)
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
         line = rows_at(ticks, along, points)
+        # Chords over two steps: between two points of a scan noise would turn the tangent.
         ahead = np.gradient(line, self.path.step, axis=0)
         # Scanned openings are noisy: they are averaged over a chord.
         width = max(1, round(CHORD / self.path.step))
@@ -129,6 +130,7 @@ class WorkSurface:
         share = (ticks - index)[:, None]
         row = (1.0 - share) * self._rows[index] + share * self._rows[index + 1]
         ahead = row[:, 3:6] / np.linalg.norm(row[:, 3:6], axis=1)[:, None]
+        # Openings need not be square to the seam: left is, and the upward axis follows from it.
         left = np.cross(row[:, 6:], ahead)
         left /= np.linalg.norm(left, axis=1)[:, None]
         beyond = (s - inside)[:, None]
@@ -138,6 +140,7 @@ class WorkSurface:
     def at(self, s: float) -> SeamPlace:
         """Return the place on the seam at an arc length [m]."""
         x, y, z, tx, ty, tz, ux, uy, uz = self._at(s)
+        # n = u x t, then u = t x n: the opening without its part along the seam
         nx, ny, nz = uy * tz - uz * ty, uz * tx - ux * tz, ux * ty - uy * tx
         norm = math.hypot(nx, ny, nz)
         nx, ny, nz = nx / norm, ny / norm, nz / norm
@@ -176,6 +179,8 @@ class WorkSurface:
         for _ in range(3):
             x, y, z, tx, ty, tz, *_ = self._at(near)
             ahead = (px - x) * tx + (py - y) * ty + (pz - z) * tz
+            # Newton's step for the foot: the distance ahead along the tangent; three rounds reach 1
+            # nm near the seam.
             near += ahead
             if abs(ahead) < 1e-9:
                 break
@@ -196,6 +201,8 @@ class WorkSurface:
         """
         stand = self.at(self.foot(point))
         off = point - stand.point
+        # Far above the seam its closest point may be anywhere; the mean opening still says what is
+        # up.
         whole = self._rows[:, 6:].mean(axis=0)
         return max(float(off @ stand.axes[:, 2]), float(off @ whole / math.sqrt(whole @ whole)))
 
@@ -259,6 +266,8 @@ class WorkSurface:
         behind = s - distance
         for _ in range(20):
             chord = tip - self.line(behind)[0]
+            # Fixed point: the torch is one tool length behind, along the chord and not along the
+            # arc.
             behind = behind + np.linalg.norm(chord, axis=1) - distance
         chord /= np.linalg.norm(chord, axis=1)[:, None]
         up = axes[:, :, 2] - np.einsum("ki,ki->k", axes[:, :, 2], chord)[:, None] * chord
@@ -278,6 +287,7 @@ def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, floa
     rows = np.hstack([points, openings])
     rows[-1] = rows[0]
     turn = float(arc_lengths(rows[:, :3])[-1])
+    # Three turns, the true one in the middle, so that no lookup meets the closure.
     rows = np.vstack([rows[:-1], rows[:-1], rows])
     return rows[:, :3], rows[:, 3:], turn
 
@@ -290,6 +300,7 @@ def rolled_out(points: Floats, openings: Floats) -> Floats:
     before, after = steps[moves[:-1]], steps[moves[1:]]
     up = openings[moves[1:]] / np.linalg.norm(openings[moves[1:]], axis=1)[:, None]
     before, after = (v - np.einsum("ki,ki->k", v, up)[:, None] * up for v in (before, after))
+    # Turns within the surface only (geodesic curvature): bending of the surface itself drops out.
     left = np.einsum("ki,ki->k", np.cross(before, after), up)
     turns = np.arctan2(left, np.einsum("ki,ki->k", before, after))
     headings = np.zeros(len(lengths))
@@ -298,6 +309,7 @@ def rolled_out(points: Floats, openings: Floats) -> Floats:
     planar = np.vstack([np.zeros(2), np.cumsum(way, axis=0)])
     whole = planar[-1]
     if np.linalg.norm(points[-1] - points[0]) < TOGETHER:
+        # A closed seam has no far end: x follows its first step.
         whole = planar[moves[0] + 1]
     x, y = whole / np.linalg.norm(whole)
     planar = planar @ np.array([[x, -y], [y, x]])
@@ -335,6 +347,8 @@ class Tool:
         ahead_x, ahead_y, _ = (position - behind).tolist()
         angle = math.atan2(ahead_y, ahead_x)
         if self._angle is not None:
+            # The arctangent jumps at half a turn, which a controller would answer with a full turn
+            # of the tool.
             angle += math.tau * round((self._angle - angle) / math.tau)
         self._angle = angle
         return ToolPose(time, position, angle)
@@ -364,6 +378,8 @@ class Tool:
         tip = rotation @ self._tip
         s = surface.foot(tip + base_T_flange.translation, self._s)
         stand = surface.at(s)
+        # Velocities in the plane are velocities on the surface: rolling out keeps lengths along the
+        # seam.
         velocity = stand.unrolled(command.velocity)
         up, tilt = self._standing(s)
         going = float(velocity @ stand.axes[:, 0])
@@ -387,6 +403,7 @@ class Tool:
         stand, (up, _) = surface.at(s), self._standing(s)
         c, sine = math.cos(angle), math.sin(angle)
         x = stand.unrolled(np.array([c, sine, 0.0]))
+        # The tool's x in the surface, made square to its own upward axis
         x = x - (x @ up) * up
         x /= np.linalg.norm(x)
         base_R_level = np.column_stack([x, np.cross(up, x), up])

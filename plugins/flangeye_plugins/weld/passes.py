@@ -51,6 +51,7 @@ class RootPass:
     def note(self, height: float) -> None:
         """Store a cycle of the root pass with the end point's height [m]."""
         root = self._root
+        # The torch may go back, after a lost wall: each place is stored once.
         if not self.rows or root.torch >= self.rows[-1][0] + PATH_SPACING:
             self.rows.append((root.torch, height, root.sigma))
 
@@ -145,6 +146,8 @@ class Passes:
         """Return the command for this cycle, given the measurements since the last one."""
         if not self.number:
             return self._root_step(pose, touches)
+        # The pose after all commands sent so far: without touch nothing else corrects the arm's
+        # delay.
         coming, self._now = self._response.ahead(pose), pose.time
         command = self._return(coming) if self.phase == "returning" else self._weld(coming)
         self._response.record(pose.time, command)
@@ -236,6 +239,7 @@ class Passes:
 
     def _swayed(self, now: float) -> WeaveOffset:
         dead, elapsed = self._response.dead_time, now - (self._began or now)
+        # What the arm carries out now was commanded one dead time ago.
         self.aim = self._pass.across + self._weave.at(elapsed - dead).aside
         return self._weave.at(elapsed).led(self._response.lag)
 
@@ -250,6 +254,8 @@ class Passes:
     def _estimate(self, error: float) -> None:
         """Update the torch's error bound, given its control error [m]; stop if it is too large."""
         settings = self._settings
+        # The arm's error enters twice, when the seam was felt and now: at worst with opposite
+        # signs.
         again = (2.0 * settings.arm_sigma) ** 2 + settings.distortion**2 + self._weave.variance
         seam = self._traced.sigma(self.torch)
         self.sigma = math.sqrt(seam**2 + again)

@@ -62,6 +62,7 @@ class Path:
         self.step = float(ticks[1])
         slopes = np.gradient(self.points, self.step, axis=0)
         norms = np.linalg.norm(slopes[:, :2], axis=1, keepdims=True)
+        # Arc length is measured in the plane, so the height's slope is left out of the norm.
         self.tangents = slopes[:, :2] / norms
         self._climb = slopes[:, 2]
         self._curvature = self._curvatures()
@@ -130,6 +131,7 @@ class Path:
         for _ in range(20):
             there, _ = self.evaluate(other)
             away = np.linalg.norm((there - here)[:, :2], axis=1)
+            # Moves the other end along the curve by what the straight distance lacks.
             other = other + np.sign(distance) * (abs(distance) - away)
         return other
 
@@ -155,6 +157,7 @@ class Path:
 
         It never decreases, and never jumps to another branch of a path that crosses itself.
         """
+        # Noise of the pose must not take progress back, and a crossing seam must not be jumped to.
         return s + min(max(self._ahead(point, s), 0.0), reach)
 
     def foot(self, point: Floats, s: float) -> float:

@@ -123,6 +123,7 @@ class SeamReach:
         count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         task = self._task
+        # A tenth of the clearance is left to the path's own deviation.
         allowed = float(task.plan.points[:, 2].max()) + 0.9 * task.params.clearance
         lowest = min(task.tool.lowest(matrix) for matrix in self._arm.flange(postures))
         if lowest >= allowed:
@@ -143,6 +144,8 @@ class SeamReach:
         """Return the feasible sequences of postures (M, n), one posture for each station."""
         found: list[Floats] = []
         refusals: list[tuple[int, Barrier]] = []
+        # Each solution at the first station begins a chain; the nearest one at each next station
+        # continues it.
         for first in postures[0]:
             chain, low, high = [first], first, first
             turns = np.zeros(len(first))
@@ -160,6 +163,7 @@ class SeamReach:
             else:
                 found.append(np.array(chain[1:]) + turns)
         if not found:
+            # The chain that came farthest says what is in the way; the others failed earlier.
             farthest, bar = max(refusals)
             raise StageError(f"weld.tactile: {stations[farthest].name}, {bar.reason}")
         return found

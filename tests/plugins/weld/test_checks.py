@@ -277,7 +277,7 @@ def test_a_plan_is_known_at_its_start_to_within_what_is_sought(share: float, tol
     asked = following()
     one = float(tube_radii(seam_of(line(0.1), sigma=1.0))[0])
     found = checked(line(0.1), sigma=share * asked.reach / one)
-    assert ("plan it more accurately, or raise 'reach'" in found) == told == bool(found)
+    assert ("plan it better, or raise 'reach'" in found) == told == bool(found)
 
 
 @pytest.mark.parametrize(("share", "told"), [(1.41, False), (1.39, True)])
@@ -335,7 +335,7 @@ def test_a_plan_may_be_less_certain_beyond_its_start() -> None:
         odd = Seam(points, seam.openings_in_base, covariance)
         assert (float(tube_radii(odd)[0]) > asked.reach) == told
         if told:
-            with pytest.raises(StageError, match="plan it more accurately, or raise 'reach'"):
+            with pytest.raises(StageError, match="plan it better, or raise 'reach'"):
                 check(odd, asked)
         else:
             check(odd, asked)

@@ -29,11 +29,8 @@ from flangeye_plugins.weld.settings import Following
 
 REMEDIES = {
     "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),
-    "askew": (
-        "along_sigma, as the tool is askew there",
-        "measure it: flangeye tactile calibrate --body",
-    ),
-    "tip": ("tip_sigma, as the tool turns there", "measure it: flangeye tactile calibrate --body"),
+    "askew": ("along_sigma, as the tool is askew", "measure it: flangeye tactile calibrate --body"),
+    "tip": ("tip_sigma, as the tool turns", "measure it: flangeye tactile calibrate --body"),
     "felt": ("the finger's gain and play, and the weave", "weld faster, or lower 'deflection'"),
 }
 """For each part of the variance: what it consists of, and how to reduce it."""

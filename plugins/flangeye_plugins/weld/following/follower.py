@@ -298,7 +298,7 @@ class Follower:
             return (
                 f"the plan curves with a radius of {1e3 / abs(plan.bend(self.tip)):.1f} mm "
                 "and the arm is off towards its centre: the tip's place along it is not "
-                "observable; plan it more accurately, or raise 'corner_radius'"
+                "observable; plan it better, or raise 'corner_radius'"
             )
         if sensing.search.bent:
             return "the tip is displaced though nothing should touch it"

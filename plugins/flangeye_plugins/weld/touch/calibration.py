@@ -61,6 +61,7 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
             f"calibration: the tag's motion leaves {unexplained * 1e3:.2f} mm of the tip's "
             f"motion unexplained, at most 0.20 mm are allowed; did the tip slide in its mark?"
         )
+    # In the tip's coordinates: what a measurement of the seam will have.
     noise = np.std([gain @ (r.translation - place) for r in rest], axis=0)
     lateral, axial = _stiffness(held)
     return Calibration.model_validate(
@@ -78,6 +79,8 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> 
 
 def _gain(tag: Floats, tip: Floats) -> Floats:
     moved = np.linalg.svd(tip, compute_uv=False)
+    # Singular values of the tip's motion: the smallest is how far it went in the least used
+    # direction.
     if moved[-1] < 0.1 * moved[0]:
         raise StageError("calibration: the robot did not move the finger along all three axes")
     # Row vectors: tip = tag @ gain.T
@@ -100,6 +103,7 @@ def _stiffness(held: Sequence[Held]) -> tuple[SI | None, SI | None]:
     tip = np.array([h.displacement for h in known])
     if np.abs(force).max() < 0.5:  # [N]: smaller forces are within a force sensor's error
         return None, None
+    # Least-squares slope per axis, means removed: a force sensor's zero drops out.
     slopes = -np.sum((force - force.mean(0)) * (tip - tip.mean(0)), 0) / np.sum(
         (tip - tip.mean(0)) ** 2, 0
     )

@@ -64,6 +64,7 @@ def pivot(what: str, poses: Sequence[Floats], displaced: Sequence[Floats] | None
     point = inverse @ np.einsum("kji,kj->i", rows, moved)
     left = moved - rows @ point
     _require_stayed(what, left)
+    # Point and mark take three parameters each.
     free = 3 * len(poses) - 6
     rms = float(np.sqrt(np.sum(left**2) / free))
     # A tip is set into its mark to 0.05 mm at best.

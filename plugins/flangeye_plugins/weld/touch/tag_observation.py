@@ -41,9 +41,11 @@ class RegionOfInterest:
     def pieces(self, image: Image) -> Iterator[ImageRegion]:
         """Yield crops to search, in order, until the tag is found."""
         if self._corners is not None:
+            # The tag moves by few pixels between two images of a finger.
             low = np.maximum(np.floor(self._corners.min(axis=0)).astype(int) - TAG_MARGIN, 0)
             high = np.ceil(self._corners.max(axis=0)).astype(int) + TAG_MARGIN
             yield cut(image, (int(low[0]), int(low[1])), (int(high[0]), int(high[1])))
+        # If the crop shows no tag, the whole image is searched: the tag may have been covered.
         yield ImageRegion(image, (0, 0))
 
     def follow(self, piece: ImageRegion, corners: Floats | None) -> None:
@@ -60,6 +62,7 @@ def cut(image: Image, start: tuple[int, int], end: tuple[int, int]) -> ImageRegi
 def shifted(matrix: Floats, corner: tuple[int, int]) -> Floats:
     """Return the camera matrix (3, 3) of a crop whose first pixel is ``corner`` (column, row)."""
     moved = np.array(matrix, dtype=np.float64)
+    # The principal point counts from the crop's own first pixel; focal lengths stay.
     moved[:2, 2] -= corner
     return moved
 
@@ -123,6 +126,7 @@ class TagDetector:
         grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         found, ids, _ = self._detector.detectMarkers(grey)
         ours = [] if ids is None else np.flatnonzero(np.ravel(ids) == self._id)
+        # Two tags of one number are a reflection, and nothing says which one is real.
         if len(ours) != 1:
             return None
         return np.asarray(found[ours[0]], dtype=np.float64).reshape(4, 2)
