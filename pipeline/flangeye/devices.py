@@ -198,7 +198,7 @@ class Scanner(Device, Protocol):
 
 
 @runtime_checkable
-class HearsLoss(Protocol):
+class DetectsLoss(Protocol):
     """Additional interface of a scanner that notices its loss at once, so a moving arm stops."""
 
     def require_alive(self) -> None:
@@ -206,13 +206,13 @@ class HearsLoss(Protocol):
 
 
 @runtime_checkable
-class Overhears(Protocol):
+class ReceivesScans(Protocol):
     """Additional interface of a scanner that receives scans which others triggered.
 
     A foreign robot program that moves the arm may trigger the scanner as well.
     """
 
-    def overhear(self, since_ns: int) -> Callable[[], Scan]:
+    def received_scan(self, since_ns: int) -> Callable[[], Scan]:
         """Return the newest scan since a given time, or the next one; see ``Scanner.expose``.
 
         Raises:

@@ -58,7 +58,7 @@ class Form:
                 for section, boxes in IMPORTED.items():
                     Import(project, self, section, boxes)
             with ui.expansion("Does it run under ROS 2?").classes("w-full"):
-                WhatRuns(project, self)
+                RunningDevices(project, self)
             self._advanced()
         with ui.column().classes("col-12 col-md gap-2"):
             self.picture()
@@ -275,7 +275,7 @@ class Import:
                 each.classes("w-full").props("dense").on_value_change(self._changed)
             self._line = command_line(project.command(*self._words()))
             ui.button(f"Import the {what}", on_click=self._import).props("outline")
-            self._told = ui.column().classes("w-full")
+            self._output = ui.column().classes("w-full")
         self._box.classes("w-full").props("dense")
 
     def _words(self) -> list[str]:
@@ -293,8 +293,8 @@ class Import:
 
     async def _import(self) -> None:
         said = await asyncio.to_thread(self._project.run_command, self._words())
-        self._told.clear()
-        with self._told:
+        self._output.clear()
+        with self._output:
             if said.startswith("error: "):
                 mistake(said.rpartition("error: ")[2])
                 return
@@ -339,12 +339,12 @@ class Recordings:
         self._folder.on_value_change(self._another)
         self._line = command_line("")
         self._button = ui.button("Look at them", on_click=self._look).props("outline no-caps")
-        self._told = ui.column().classes("w-full gap-1")
+        self._output = ui.column().classes("w-full gap-1")
         self._another()
 
     def _another(self) -> None:
         self._given = {}
-        self._told.clear()
+        self._output.clear()
         self._line.text = self._project.command(*self._words("recorded"))
         self._button.set_enabled(bool(self._folder.value))
 
@@ -359,9 +359,9 @@ class Recordings:
         self._button.disable()
         said, drafted = await draft(self._project, self._form, self._words, "recorded")
         self._button.enable()
-        self._told.clear()
+        self._output.clear()
         lines = said.splitlines()[: -1 if drafted else None]
-        with self._told:
+        with self._output:
             for option, answer in self._given.items():
                 self._box(option, _words_of(option), answer)
             for line in lines:
@@ -387,7 +387,7 @@ def _words_of(option: str) -> str:
     return option.removeprefix("--").replace("-", " ")
 
 
-class WhatRuns:
+class RunningDevices:
     """Form for running ROS 2 devices, from which ``flangeye init --ros2`` writes the recipe."""
 
     def __init__(self, project: Project, form: Form) -> None:
@@ -425,7 +425,7 @@ class WhatRuns:
             printed.classes("w-full")
             self._line = command_line(self._project.command(*self._words("running")))
             ui.button("Write the recipe", on_click=self._draft).props("outline no-caps")
-            self._told = ui.column().classes("w-full gap-0")
+            self._output = ui.column().classes("w-full gap-0")
 
     def _running(self) -> list[Running]:
         with self._project.registry.graph() as graph:
@@ -461,8 +461,8 @@ class WhatRuns:
     async def _draft(self) -> None:
         """Run the command to write a recipe of a new name, and make that the cell's recipe."""
         said, drafted = await draft(self._project, self._form, self._words, "running")
-        self._told.clear()
-        with self._told:
+        self._output.clear()
+        with self._output:
             if not drafted:
                 mistake(said.rpartition("error: ")[2])
                 return

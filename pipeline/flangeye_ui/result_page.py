@@ -192,7 +192,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
         with ui.expansion("Check it by touch").classes("w-full"):
             TouchBox(project, run, calibration)
     with ui.expansion("What would make it better", value=True).classes("w-full"):
-        Better(project, run, facts)
+        Improvements(project, run, facts)
     with ui.expansion("Ask the doctor what is wrong").classes("w-full") as box:
         Doctor(project, run, box)
     if (report := run / "report.html").exists():
@@ -374,7 +374,7 @@ def _residuals(scene: Scene3D, facts: Facts) -> float:
     return times
 
 
-class Better:
+class Improvements:
     """Suggestions that would improve the calibration: missing motions."""
 
     def __init__(self, project: Project, run: Path, facts: Facts) -> None:
@@ -403,7 +403,7 @@ class Doctor:
     def __init__(self, project: Project, run: Path, box: ui.expansion) -> None:
         self._project, self._run, self._asked = project, run, False
         box.on_value_change(self._ask)
-        self._told = ui.column().classes("w-full gap-1")
+        self._output = ui.column().classes("w-full gap-1")
         command_line(project.command("doctor", str(run.relative_to(project.folder))))
 
     async def _ask(self) -> None:
@@ -411,14 +411,14 @@ class Doctor:
         if self._asked:
             return
         self._asked = True
-        with self._told:
+        with self._output:
             ui.spinner()
         try:
             findings, error = await asyncio.to_thread(self._findings), ""
         except FlangeyeError as refused:
             findings, error = (), str(refused)
-        self._told.clear()
-        with self._told:
+        self._output.clear()
+        with self._output:
             if error:
                 mistake(error)
             elif not findings:

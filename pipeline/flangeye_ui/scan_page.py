@@ -98,7 +98,7 @@ class RunPanel:
         ui.label("Scans").classes("part").props('role="heading" aria-level="2"')
         self._shots = ui.element("div").classes("shots")
         self._more = ui.expansion("Residuals, places and what was logged").classes("w-full")
-        self._more.on_value_change(self._tell)
+        self._more.on_value_change(self._show_log)
         with self._more:
             ui.label("Residual of each pose so far").classes("note")
             self._bars = ui.echart(residual_chart({}, {})).classes("w-full h-40")
@@ -155,7 +155,7 @@ class RunPanel:
         said = [*view.rows(), *view.events, run.code, run.outlook]
         if said != self._said:
             self._said = said
-            self._tell()
+            self._show_log()
             self._judge(run)
         if (run.path, run.arrived) != self._shown:
             self._shown = (run.path, run.arrived)
@@ -165,7 +165,7 @@ class RunPanel:
         for capture, picture in {**dict.fromkeys(bare, ""), **run.shots}.items():
             self._shot(run, capture, picture)
 
-    def _tell(self) -> None:
+    def _show_log(self) -> None:
         """Show residuals, places and the log, while that section is open."""
         run = self._project.run
         if run is None or not self._more.value:

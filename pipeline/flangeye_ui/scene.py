@@ -373,12 +373,12 @@ class ScanView:
 
     def __init__(self, log: RunLog | None = None) -> None:
         self.log = log
-        self._told = ui.label().props('role="status"')
+        self._output = ui.label().props('role="status"')
         self._scene = Scene3D(340, SCANNED)
 
     def say(self, text: str) -> None:
         """Show a text in place of a scan's verdict."""
-        self._told.text = text
+        self._output.text = text
 
     def show(self, capture: str) -> None:
         """Show a scan: its flange, the fitted rim, and its outcome."""

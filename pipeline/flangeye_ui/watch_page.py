@@ -53,7 +53,7 @@ class Watch:
     def __init__(self, project: Project, stored: list[str], bar: ActionBar, client: Client) -> None:
         self._project, self._stored, self._bar = project, stored, bar
         self._control = Control(project, client, bar)
-        self._told = None if self._control.running else project.run
+        self._shown_run = None if self._control.running else project.run
         self._recipe: Recipe | None = None
         self._arrived = 0
         ui.label(
@@ -142,14 +142,14 @@ class Watch:
         run, running = self._project.run, self._control.running
         for button in (self._check, self._again):
             button.set_visibility(not running)
-        if run is None or (run is self._told and not running):
+        if run is None or (run is self._shown_run and not running):
             return
         if running:
             self._bar.say(status_line(run, self._control.mine))
         if run.checks:
             self._scans(run)
         if not running:
-            self._told = run
+            self._shown_run = run
             self._mistakes([*run.said, *([f"error: {run.stopped}"] if run.stopped else [])])
             await self.show()
 

@@ -34,13 +34,13 @@ class ManualArc(Device):
         """Ask the person to open or close the gas."""
         if on != self._flows:
             self._flows = on
-            self._tell("GAS ON" if on else "GAS OFF")
+            self._ask_person("GAS ON" if on else "GAS OFF")
 
     def burn(self, on: bool) -> None:
         """Ask the person to strike or end the arc."""
         if on != self._burns:
             self._burns = on
-            self._tell("STRIKE THE ARC NOW" if on else "END THE ARC NOW")
+            self._ask_person("STRIKE THE ARC NOW" if on else "END THE ARC NOW")
 
     def burning(self) -> bool | None:
         """Return None: there is no arc signal."""
@@ -51,7 +51,7 @@ class ManualArc(Device):
         self.burn(False)
         self.gas(False)
 
-    def _tell(self, what: str) -> None:
+    def _ask_person(self, what: str) -> None:
         bell = "\a"
         sys.stderr.write(f"{bell}>>> {what} <<<\n")
         sys.stderr.flush()

@@ -25,7 +25,7 @@ from flangeye.workflow.recipe.header import LimitsSection
 from flangeye.workflow.recipe.load import Recipe
 from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.settings import WeldTactileParams
-from flangeye_plugins.weld.touch.calibration import Held, calibrate
+from flangeye_plugins.weld.touch.calibration import HeldReading, calibrate
 from flangeye_plugins.weld.touch.pivot import Pivot, pivot
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter
@@ -113,7 +113,7 @@ def _guided(
         if body:
             with arm.standing() as robot:
                 hand = HandGuide(robot, ask, lambda: readings(robot).take(EACH))
-                pivoted = Pivoted(hand.tip(finger, found), hand.torch())
+                pivoted = ToolPoints(hand.tip(finger, found), hand.torch())
     measured = found.lateral is not None
     if not measured and finger.calibration is not None:
         known = finger.calibration
@@ -195,7 +195,7 @@ class ReadingGuide:
                 found += [reading] if reading is not None else []
         return found
 
-    def held(self) -> Iterator[Held]:
+    def held(self) -> Iterator[HeldReading]:
         """Move the arm about its present pose with the tip held fixed; yield the readings."""
         start = self._drive.tick()
         base_R_tool = start.base_T_flange.rotation @ self._flange_R_tool
@@ -207,7 +207,7 @@ class ReadingGuide:
             )
             force = _difference(state.force, start.force)
             for reading in self.take(EACH):
-                yield Held(reading, -moved, None if force is None else base_R_tool.T @ force)
+                yield HeldReading(reading, -moved, None if force is None else base_R_tool.T @ force)
         self._go(start.base_T_flange, np.zeros(3))
 
     def _go(self, start: Transform, by: Floats) -> None:
@@ -232,7 +232,7 @@ def _difference(force: Any, tare: Any) -> Floats | None:
     return np.asarray(force[:3] - tare[:3], dtype=np.float64)
 
 
-class Pivoted(NamedTuple):
+class ToolPoints(NamedTuple):
     """Both points of the tool."""
 
     tip: Pivot
@@ -273,7 +273,7 @@ class HandGuide:
         return self._robot.state().base_T_flange.matrix
 
 
-def with_body(finger: Finger, found: Pivoted) -> Finger:
+def with_body(finger: Finger, found: ToolPoints) -> Finger:
     """Return a finger's file with the estimated tip and torch, and their covariances.
 
     The tool's x is the direction from torch to tip, seen along the flange's z, to which its own
@@ -296,7 +296,7 @@ def with_body(finger: Finger, found: Pivoted) -> Finger:
     return placed.model_copy(update=told)
 
 
-def summary_lines(found: Pivoted) -> list[str]:
+def summary_lines(found: ToolPoints) -> list[str]:
     """Return the results as text."""
     tip, torch = (
         "'" + ", ".join(f"{x * 1e3:.2f} mm" for x in point.point) + "'" for point in found

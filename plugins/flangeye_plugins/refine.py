@@ -9,10 +9,10 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, StageError, stage
-from flangeye.estimation.arm_parameters import ArmParameters, most_telling_poses, parameters_of
+from flangeye.estimation.arm_parameters import ArmParameters, most_informative_poses, parameters_of
 from flangeye.estimation.calibrate import Options, answered
 from flangeye.estimation.effects.arm import known
-from flangeye.estimation.plan import foreseen, foreseen_poses
+from flangeye.estimation.plan import predict, predicted_poses
 from flangeye.estimation.session import Session, session_of
 from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.kinematics import Arm
@@ -255,7 +255,7 @@ def _proposed(session: Session, told: ArmParameters, count: int) -> list[str]:
     candidates = _candidates(session)
     if not count or not candidates:
         return []
-    chosen, after = most_telling_poses(session, told, candidates, count)
+    chosen, after = most_informative_poses(session, told, candidates, count)
     listed = "; ".join(
         ", ".join(f"{x:.0f}" for x in np.degrees(candidates[i].joints)) for i in chosen
     )
@@ -277,7 +277,7 @@ def _candidates(session: Session) -> list[Observation]:
     joints = joints[((joints > arm.lower) & (joints < arm.upper)).all(axis=1)]
     like = session.observations[0]
     moments = [_at(like, pose, q) for pose, q in zip(arm.flange(joints), joints, strict=True)]
-    seen = foreseen_poses(moments, places, session.cell)
+    seen = predicted_poses(moments, places, session.cell)
     before = np.array([o.feature.centre for o in session.observations])
     margin = 0.05  # a camera is taken to see the target so far about where it did [m]
     near = (seen[:, :3, 3] > before.min(axis=0) - margin) & (
@@ -288,7 +288,7 @@ def _candidates(session: Session) -> list[Observation]:
     squarest = np.cos(np.radians(50))
     kept = near.all(axis=1) & (facing > squarest * np.linalg.norm(seen[:, :3, 3], axis=1))
     chosen = [moments[i] for i in np.flatnonzero(kept)]
-    return foreseen(chosen, places, session.cell) if chosen else []
+    return predict(chosen, places, session.cell) if chosen else []
 
 
 def _at(like: Observation, pose: Floats, joints: Floats) -> Observation:

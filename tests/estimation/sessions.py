@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error, foreseen
+from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error, predicted_work
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
 from flangeye.estimation.session import ModelOptions, effects_of
@@ -111,7 +111,7 @@ def score(kind: str, arm: dict, s: float, poses: int, seed: int, told: bool = Tr
         _scored(found, as_true(found), session.camera, points),
         _scored(found, answer, truth, points),
         _of_svd(session, truth, points) if kind in ("flange", "centres") else np.nan,
-        expected_error(foreseen(found, work), answer.mean).rms,
+        expected_error(predicted_work(found, work), answer.mean).rms,
         int((~found.inliers).sum()),
     )
 

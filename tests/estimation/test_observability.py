@@ -22,7 +22,7 @@ from flangeye.estimation.observability import (
     require_several_places,
     robust_sigma,
     spread_of,
-    telling,
+    suggest,
     weak_moves,
 )
 from flangeye.types import Floats
@@ -79,11 +79,11 @@ def test_as_few_motions_are_named_as_show_what_is_weak() -> None:
     known, limits = np.diag([4.0, 0.0, 0.0, 0.0]), np.ones(4)
     motions = {"first": np.diag([9.0, 0, 0, 0]), "second": np.diag([0, 9.0, 0, 0]),
                "third": np.diag([0, 9.0, 9.0, 0])}  # fmt: skip
-    chosen, left = telling(known, limits, motions)
+    chosen, left = suggest(known, limits, motions)
     assert chosen == ["third"]
     assert np.abs(left.moves).argmax(axis=0).tolist() == [3]
-    assert telling(np.diag([4.0] * 4), limits, motions)[0] == []
-    assert telling(known, limits, {})[0] == []
+    assert suggest(np.diag([4.0] * 4), limits, motions)[0] == []
+    assert suggest(known, limits, {})[0] == []
 
 
 def still(count: int = 6) -> Floats:
@@ -251,6 +251,6 @@ def test_a_motion_is_named_that_makes_what_is_weak_known_twice_as_well() -> None
     for excess, after, named in ((10.0, 4.9, True), (10.0, 5.1, False), (9e3, 2e3, False),
                                  (9e3, 499.0, True), (9e3, 501.0, False)):  # fmt: skip
         known, better = np.diag([4.0, excess**-2]), np.diag([0.0, after**-2 - excess**-2])
-        chosen, left = telling(known, np.ones(2), {"it": better})
+        chosen, left = suggest(known, np.ones(2), {"it": better})
         assert chosen == (["it"] if named else [])
         assert left.excess[0] == pytest.approx(after if named else excess)

@@ -6,13 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.plan import (
-    _moved,
-    best_next,
-    errors_at_work,
-    foreseen,
-    so_far,
-)
+from flangeye.estimation.plan import _moved, best_next, errors_at_work, predict, so_far
 from flangeye.files.paths import bundled
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
@@ -53,7 +47,7 @@ def test_the_choice_is_the_one_after_which_least_is_left_unknown(session: Any) -
         return sum(e**2 for e in errors_at_work(with_it, cell, seen).values())
 
     some = candidates[::5]
-    expected = [foreseen([o], found.places, cell)[0] for o in some]
+    expected = [predict([o], found.places, cell)[0] for o in some]
     chosen = best_next(expected, found, cell, seen)
     assert some[chosen].camera == "right"
     states = np.array([left(o) for o in some])

@@ -5,7 +5,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from flangeye.estimation.readings import Axes, Pairs, Reading, meant, optical, other_axes
+from flangeye.estimation.readings import Axes, Pairs, Reading, likely, optical, other_axes
 from flangeye.types import Floats
 from flangeye.types.geometry import invert
 from tests.estimation import foreign
@@ -29,7 +29,7 @@ def distances(ends: tuple[Floats, Floats]) -> tuple[float, float]:
 @pytest.mark.parametrize("kind", ["marker", "hand"])
 def test_a_sound_session_is_meant_as_it_is(kind: str) -> None:
     pairs, *ends = sound(kind)
-    assert meant(pairs, *distances((ends[0], ends[1])), MODEL) == [Reading()]
+    assert likely(pairs, *distances((ends[0], ends[1])), MODEL) == [Reading()]
     assert other_axes(pairs.marker[:, :3, 3]) is None
 
 
@@ -47,7 +47,7 @@ def test_what_fits_alike_is_told_by_places_and_errors(
 ) -> None:
     pairs, carried, standing = sound(kind)
     ends = (standing, carried) if inverse else (carried, standing)
-    assert meant(mistake.of(pairs), *distances(ends), MODEL) == [mistake]
+    assert likely(mistake.of(pairs), *distances(ends), MODEL) == [mistake]
 
 
 @pytest.mark.parametrize("kind", ["marker", "hand"])
@@ -58,7 +58,7 @@ def test_exchanged_tables_are_exchanged_back(kind: str) -> None:
         back = Reading(exchanged=True, robot_inverted=True, marker_inverted=True)
     else:
         given, back = Pairs(pairs.marker, pairs.robot, False), Reading(exchanged=True)
-    found = meant(given, *distances((carried, standing)), MODEL)
+    found = likely(given, *distances((carried, standing)), MODEL)
     assert back in found and Reading() not in found
     assert np.allclose(back.of(given).robot, pairs.robot)
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
-from flangeye.maths.offset_wrist import Undecomposed
+from flangeye.maths.offset_wrist import DecompositionFailed
 from flangeye.models.loading import load_model
 from flangeye.models.robots import Joint
 from flangeye.types.geometry import rigid, rotation_from_rpy, rotation_log
@@ -246,7 +246,7 @@ def test_what_eaik_does_not_solve_is_iterated(monkeypatch: pytest.MonkeyPatch) -
     best = arm._held[0]
 
     def fails(pose):
-        raise Undecomposed("of the library")
+        raise DecompositionFailed("of the library")
 
     arm._forms[best] = [fails] * 8
     assert len(arm.inverse(pose)) > 1

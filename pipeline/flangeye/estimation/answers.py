@@ -264,7 +264,7 @@ class PredictedWork:
     squares: Floats
 
 
-def foreseen(found: Estimate, work: Work) -> PredictedWork:
+def predicted_work(found: Estimate, work: Work) -> PredictedWork:
     """Return the prediction of sightings at new poses of the work.
 
     It covers what errors of held-out poses consist of: the calibration's error, the arm's non-rigid
@@ -288,16 +288,16 @@ def foreseen(found: Estimate, work: Work) -> PredictedWork:
 
 
 def expected_error(
-    there: PredictedWork, answer: Floats, put_right: Floats | float = 0.0
+    there: PredictedWork, answer: Floats, corrected_part: Floats | float = 0.0
 ) -> ExpectedError:
     """Return the predictive spread of an answer at new poses of the work.
 
     Args:
         there: The predicted sightings.
         answer: (P,) moves of the places.
-        put_right: (K,) correction of the arms' errors, as parameters of the effects.
+        corrected_part: (K,) correction of the arms' errors, as parameters of the effects.
     """
-    numbers = np.broadcast_to(put_right, there.rows.shape[2] - len(answer))
+    numbers = np.broadcast_to(corrected_part, there.rows.shape[2] - len(answer))
     bias = there.means - there.rows @ np.concatenate([answer, numbers])
     exact = (bias**2).sum(axis=2).mean(axis=1) + there.squares
     values = ((bias[:, None] + there.drawn) ** 2).sum(axis=3).reshape(len(exact), -1)

@@ -12,7 +12,7 @@ from flangeye.estimation.effects.arm import joints_known
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.estimation.mixed import fit
-from flangeye.estimation.plan import most_telling, whitened
+from flangeye.estimation.plan import most_informative, whitened
 from flangeye.estimation.session import Session
 from flangeye.estimation.sightings import branches_of
 from flangeye.types import FLANGE, Floats, Indices, Mask, Observation
@@ -133,7 +133,7 @@ def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
     return columns, np.tile([zeros, lengths, lengths, twists], (len(joint), 1))
 
 
-def most_telling_poses(
+def most_informative_poses(
     session: Session, known: ArmParameters, candidates: Sequence[Observation], count: int
 ) -> tuple[Indices, ArmParameters]:
     """Return the most informative further sightings, and the covariance with them.
@@ -149,7 +149,7 @@ def most_telling_poses(
     covariance = _loosely(found, of_size)
     rows, _ = whitened(candidates, found, session.cell)
     levers = np.eye(len(covariance))[columns.ravel()] / known.sizes.ravel()[:, None]
-    chosen, after = most_telling(rows, covariance, levers, count)
+    chosen, after = most_informative(rows, covariance, levers, count)
     left = levers @ after @ levers.T
     deviations = known.sizes * np.sqrt(np.diag(left)).reshape(known.sizes.shape)
     return chosen, replace(known, alone=left, deviations=np.minimum(deviations, known.deviations))

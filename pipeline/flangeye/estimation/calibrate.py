@@ -16,12 +16,12 @@ from flangeye.estimation.answers import (
     as_true,
     commanded,
     expected_error,
-    foreseen,
     functional,
     moves,
+    predicted_work,
 )
 from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
-from flangeye.estimation.corrections import CORRECTED, corrections_of, put_right
+from flangeye.estimation.corrections import CORRECTED, corrected_part, corrections_of
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Places, Problem
@@ -113,11 +113,11 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
     every = commanded(found, work)
     commands = every, every * left
     uncorrected, righted = (functional(found, each) for each in commands)
-    reported, there = _reported(session, uncorrected, weak), foreseen(found, work)
+    reported, there = _reported(session, uncorrected, weak), predicted_work(found, work)
     expected = expected_error(there, uncorrected.mean)
     corrected = _corrected(session, righted, weak)
     if corrected is not None:
-        then = expected_error(there, righted.mean, put_right(found))
+        then = expected_error(there, righted.mean, corrected_part(found))
         # It is given where it expects nine tenths of the error or less
         corrected = replace(corrected, expected=then) if then.rms <= 0.9 * expected.rms else None
 
@@ -180,7 +180,7 @@ def calibrate_at(
     return replace(
         answer,
         pairs=tuple(replace(pair, used=True, reason=None) for pair in pairs),
-        expected=expected_error(foreseen(found, work), there),
+        expected=expected_error(predicted_work(found, work), there),
         method=method,
         true=tuple(_estimates(session, true, weak)),
         notes=session.notes,

@@ -67,11 +67,11 @@ def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
     bare[0, 0] -= cost / size
     dual = _Dual.of(bare, squares.families)
     # Most certificates take twenty
-    sought = dual.sought(_across(squares.alike(found)), 150)
-    share = dual.missing(sought)
+    find_multipliers = dual.find_multipliers(_across(squares.alike(found)), 150)
+    share = dual.missing(find_multipliers)
     if share <= GAP:
         return Certificate(places @ found, cost, share * size, True)
-    elsewhere = _elsewhere(squares, dual.lacks(sought), len(places))
+    elsewhere = _elsewhere(squares, dual.lacks(find_multipliers), len(places))
     lower = squares.cost(elsewhere) < cost - GAP * size
     better = places @ elsewhere if lower else None
     return Certificate(places @ found, cost, share * size, False, better)
@@ -113,7 +113,7 @@ class _Block(NamedTuple):
     first: Floats
     others: Floats
 
-    def naught(self, matrix: Floats) -> Floats:
+    def project(self, matrix: Floats) -> Floats:
         """Project a matrix onto the matrices whose quadratic form vanishes for all places."""
         size = len(matrix) // 10
         pairs = matrix.reshape(10, size, 10, size).swapaxes(1, 2).reshape(100, -1)
@@ -153,16 +153,16 @@ class _Dual(NamedTuple):
         for block in self.blocks:
             end = start + len(block.at) ** 2
             matrix = multipliers[start:end].reshape(len(block.at), -1)
-            out[np.ix_(block.at, block.at)] += block.naught(matrix)
+            out[np.ix_(block.at, block.at)] += block.project(matrix)
             start = end
         return out
 
     def parts(self, matrix: Floats) -> Floats:
         """Return the multipliers' derivative along a matrix."""
-        parts = (block.naught(matrix[np.ix_(block.at, block.at)]) for block in self.blocks)
+        parts = (block.project(matrix[np.ix_(block.at, block.at)]) for block in self.blocks)
         return np.concatenate([part.ravel() for part in parts])
 
-    def sought(self, still: Floats, tries: int, start: Floats | None = None) -> Floats:
+    def find_multipliers(self, still: Floats, tries: int, start: Floats | None = None) -> Floats:
         """Return dual multipliers whose matrix is positive semidefinite, or nearly so.
 
         Args:
@@ -207,7 +207,7 @@ class _Dual(NamedTuple):
     def lacks(self, multipliers: Floats) -> Floats:
         """Return the (n, n) distance of the dual matrix from the nearest semidefinite one."""
         # Where there is no certificate, so many for a better place
-        matrix = self.at(self.sought(np.eye(len(self.bare)), 50, multipliers))
+        matrix = self.at(self.find_multipliers(np.eye(len(self.bare)), 50, multipliers))
         return np.asarray(_nearest(matrix) - matrix)
 
 

@@ -19,7 +19,7 @@ CORRECTED = frozenset({"zeros", "lengths", "twists", "field"})
 their non-rigid part; the rigid part stays in the camera's pose."""
 
 
-def put_right(found: Estimate) -> Floats:
+def corrected_part(found: Estimate) -> Floats:
     """Return the (K,) part of the effects' values that a correction removes.
 
     That is the parameters of the correction. Its smooth error takes up the other displacements of
@@ -36,7 +36,7 @@ def put_right(found: Estimate) -> Floats:
 
 def corrections_of(found: Estimate, tool_offset: Floats) -> dict[str, ArmCorrection]:
     """Return the correction of each arm that carries a camera or a target."""
-    numbers = put_right(found)
+    numbers = corrected_part(found)
     return {c.arm: _correction(found, c, tool_offset, numbers) for c in _flanges(found)}
 
 

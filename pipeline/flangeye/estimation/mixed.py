@@ -101,7 +101,7 @@ class LinearModel:
         some = {name: getattr(self, name)[rows] for name in each}
         return replace(self, causes=self.causes[:, rows], **some)
 
-    def telling(self) -> LinearModel:
+    def subsampled(self) -> LinearModel:
         """Return the model of a subset of the sightings, evenly spread over all."""
         kept = np.flatnonzero(self.shares)
         if len(kept) <= TELLING:
@@ -354,7 +354,7 @@ class Peak(NamedTuple):
 
 def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
     """Return the most likely sizes, searched from a start or from the prior medians."""
-    prior, model = model.sizes, model.telling()
+    prior, model = model.sizes, model.subsampled()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
     here = fit(model, prior.at(z), with_slopes=True)
     # Newton's steps: five or six are usual
@@ -390,7 +390,7 @@ def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Flo
 
 def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
     """Return the joint posterior, with the sizes marginalised by sampling about their mode."""
-    (z, spread), some, prior = mode, model.telling(), model.sizes
+    (z, spread), some, prior = mode, model.subsampled(), model.sizes
     fits, logs = [], []
     # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
     # give or take 6 % from session to session

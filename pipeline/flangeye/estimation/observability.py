@@ -64,7 +64,7 @@ def weak_moves(information: Floats, limits: Floats) -> WeakModes:
     return WeakModes(limits[:, None] * vectors[:, weak], excess)
 
 
-def telling(
+def suggest(
     information: Floats, limits: Floats, further: Mapping[Motion, Floats]
 ) -> tuple[list[Motion], WeakModes]:
     """Return motions, chosen greedily, that make the weak moves observable, and what stays weak.
@@ -469,7 +469,7 @@ def _refusal(
     named = _named(problem, weak, scale)
     share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))
     # What is named is to make everything known three times better than its limit
-    motions, left = telling(information, scale / 3.0, _seen_again(problem, places, freedoms))
+    motions, left = suggest(information, scale / 3.0, _seen_again(problem, places, freedoms))
     # Within thirty limits more sightings of the same kind help; beyond, the parts lack a tie
     untied = left and left.excess[0] > 30.0
     cures = _asked(problem, motions)

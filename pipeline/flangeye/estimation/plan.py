@@ -136,7 +136,7 @@ def work_of_frames(found: Preview, cell: Cell, seen: Sequence[Observation]) -> M
     return work
 
 
-def most_telling(
+def most_informative(
     rows: Floats, covariance: Floats, levers: Floats, count: int
 ) -> tuple[Indices, Floats]:
     """Choose sightings greedily; each one minimises the variance that remains.
@@ -175,11 +175,11 @@ def best_next(
         seen: The sightings so far.
     """
     rows, _ = whitened(candidates, found, cell)
-    chosen, _ = most_telling(rows, found.fit.covariance, _levers(found, cell, seen), 1)
+    chosen, _ = most_informative(rows, found.fit.covariance, _levers(found, cell, seen), 1)
     return int(chosen[0])
 
 
-def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list[Observation]:
+def predict(moments: Sequence[Observation], places: Places, cell: Cell) -> list[Observation]:
     """Return M sightings of one target by one camera, as predicted from the estimate so far.
 
     Args:
@@ -188,14 +188,14 @@ def foreseen(moments: Sequence[Observation], places: Places, cell: Cell) -> list
         places: (4, 4) of each unknown, as estimated so far.
         cell: The graph of frames.
     """
-    poses = foreseen_poses(moments, places, cell)
+    poses = predicted_poses(moments, places, cell)
     return [
         replace(moment, feature=_moved(moment.feature, pose))
         for moment, pose in zip(moments, poses, strict=True)
     ]
 
 
-def foreseen_poses(moments: Sequence[Observation], places: Places, cell: Cell) -> Floats:
+def predicted_poses(moments: Sequence[Observation], places: Places, cell: Cell) -> Floats:
     """Return (M, 4, 4) camera_T_target at these moments, predicted from the estimate so far."""
     frames = {
         name: replace(frame, place=places.get(name, frame.place))

@@ -89,7 +89,9 @@ class Reading(NamedTuple):
         return " and ".join(filter(None, words))
 
 
-def meant(pairs: Pairs, carried: float, standing: float, robot: RobotModel | None) -> list[Reading]:
+def likely(
+    pairs: Pairs, carried: float, standing: float, robot: RobotModel | None
+) -> list[Reading]:
     """Return the readings that may be meant, likeliest first; several if the data do not decide.
 
     Args:

@@ -58,7 +58,7 @@ def begin(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
         CalibrationRefused: No initial guess is found.
     """
     rng = np.random.default_rng(0)
-    places = _grown(problem, rng)
+    places = _solve_loops(problem, rng)
     if places is not None:
         found = _descended(problem, places)
         if len(problem.ends) == 1 or _plausible(problem, found[1]):
@@ -121,7 +121,7 @@ def _sized_translations(carried: Floats, seen: Floats, turn: Floats) -> tuple[Fl
 # --- from loop to loop ---------------------------------------------------------------------------
 
 
-def _grown(problem: Problem, rng: np.random.Generator) -> dict[str, Floats] | None:
+def _solve_loops(problem: Problem, rng: np.random.Generator) -> dict[str, Floats] | None:
     """Solve loop by loop, fewest unknowns first; return the places, or None if stuck."""
     known: dict[str, Floats] = {}
     left = set(range(len(problem.ends)))

@@ -16,8 +16,8 @@ import numpy as np
 
 from flangeye.maths.offset_wrist import (
     ClosedForm,
+    DecompositionFailed,
     OffsetWrist,
-    Undecomposed,
     closed_form,
     offset_wrist,
 )
@@ -436,7 +436,7 @@ def _solutions(forms: Sequence[ClosedForm], base_T_flange: Floats) -> Floats | N
     """Return the solutions (K, n) of closed forms for a pose; None if every form fails."""
     found = []
     for form in forms:
-        with suppress(Undecomposed):
+        with suppress(DecompositionFailed):
             found.append(form(base_T_flange))
     return np.concatenate(found) if found else None
 

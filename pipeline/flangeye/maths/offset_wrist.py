@@ -275,7 +275,7 @@ ClosedForm = Callable[[Floats], Floats]
 """(4, 4) base_T_flange -> (K, 6) joint angles near its solutions [rad]."""
 
 
-class Undecomposed(ArithmeticError):
+class DecompositionFailed(ArithmeticError):
     """EAIK cannot solve a pose with its decomposition of the arm."""
 
 
@@ -289,7 +289,7 @@ def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
 
     Returns:
         None where EAIK is not installed or knows no decomposition. The closed form raises
-        :class:`Undecomposed` where EAIK fails at a pose.
+        :class:`DecompositionFailed` where EAIK fails at a pose.
     """
     forms = (_decomposed(*axes, flange) for axes in as_meant(directions, points))
     return next((form for form in forms if form is not None), None)
@@ -336,7 +336,7 @@ def _decomposed(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
         try:
             joints: Floats = np.asarray(robot.calculate_IK(base_T_flange).Q).reshape(-1, 6)
         except RuntimeError as error:
-            raise Undecomposed(str(error)) from None
+            raise DecompositionFailed(str(error)) from None
         return np.asarray(signs * joints)
 
     return solve

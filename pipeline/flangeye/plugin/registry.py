@@ -36,7 +36,7 @@ class DuplicatePluginError(FlangeyeError):
 Kind = TypeVar("Kind", Stage, Part)
 
 
-class Offered(MutableMapping[str, Kind]):
+class PluginTable(MutableMapping[str, Kind]):
     """Stages or parts by name, each imported when it is asked for."""
 
     def __init__(self, sort: type[Kind]) -> None:
@@ -103,8 +103,8 @@ class Registry:
     """
 
     hooks: pluggy.PluginManager
-    stages: Offered[Stage] = field(default_factory=lambda: Offered(Stage))
-    parts: Offered[Part] = field(default_factory=lambda: Offered(Part))
+    stages: PluginTable[Stage] = field(default_factory=lambda: PluginTable(Stage))
+    parts: PluginTable[Part] = field(default_factory=lambda: PluginTable(Part))
     broken: dict[str, Exception] = field(default_factory=dict)
     owners: dict[str, str] = field(default_factory=dict)
     installed: dict[str, Distribution | None] = field(default_factory=dict)
@@ -208,7 +208,7 @@ class Registry:
                 if implementation.plugin is plugin:
                     self._add(owner, implementation.function(), places)
 
-    def _add(self, owner: str, offers: Any, places: Offered[Any]) -> None:
+    def _add(self, owner: str, offers: Any, places: PluginTable[Any]) -> None:
         if isinstance(offers, Mapping):
             for name, place in offers.items():
                 self._own(owner, name)

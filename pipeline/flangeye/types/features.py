@@ -14,7 +14,7 @@ from flangeye.types.frames import (
     TARGET,
     FrameMismatchError,
     Motion,
-    Placed,
+    PosedMeasurement,
     Poses,
     Transform,
 )
@@ -147,7 +147,7 @@ class Rejection:
 
 
 @dataclass(frozen=True, eq=False)
-class Observation(Placed):
+class Observation(PosedMeasurement):
     """A fitted feature and the robot poses it belongs to: one equation for the solver.
 
     Attributes:

@@ -158,7 +158,7 @@ def by_frame(*transforms: Transform | None) -> Poses:
     return {each.child: each for each in transforms if each is not None}
 
 
-class Placed:
+class PosedMeasurement:
     """A measurement, with the poses that controllers reported at its time."""
 
     poses: Poses

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from flangeye.types.arrays import Array, Note, Pixels, freeze
-from flangeye.types.frames import CAMERA, TARGET, Motion, Placed, PointCloud, Poses
+from flangeye.types.frames import CAMERA, TARGET, Motion, PointCloud, PosedMeasurement, Poses
 
 Role = Literal["calibration", "verification"]
 
@@ -48,7 +48,7 @@ class Image:
 
 
 @dataclass(frozen=True, eq=False)
-class Capture(Placed):
+class Capture(PosedMeasurement):
     """One scan of the target, with the robot's pose at that time.
 
     Attributes:

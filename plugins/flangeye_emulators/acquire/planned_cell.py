@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.estimation.plan import Preview, best_next, foreseen, foreseen_poses, so_far
+from flangeye.estimation.plan import Preview, best_next, predict, predicted_poses, so_far
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Axis, Cell, chain
 from flangeye.plugin.stage import PlaceParams
@@ -108,10 +108,10 @@ class NextBest:
         cell = self._planned.moments.cell
         # Who may see whom, and what such a sighting measures.
         pairs = {(o.camera, o.target): o for o in seen}
-        foreseen = [o for like in pairs.values() for o in self._in_view(like, self._found)]
-        if not foreseen:
+        expected = [o for like in pairs.values() for o in self._in_view(like, self._found)]
+        if not expected:
             return None
-        best = foreseen[best_next(foreseen, self._found, cell, seen)]
+        best = expected[best_next(expected, self._found, cell, seen)]
         return int(best.id), best.camera, best.target
 
     def _in_view(self, like: Observation, found: Preview) -> list[Observation]:
@@ -124,8 +124,8 @@ class NextBest:
             for i in map(int, drawn)
             if i not in self._taken
         ]
-        foretold = foreseen(reported, found.places, moments.cell)
-        visible = self._planned.view.sees(foreseen_poses(reported, found.places, moments.cell))
+        foretold = predict(reported, found.places, moments.cell)
+        visible = self._planned.view.sees(predicted_poses(reported, found.places, moments.cell))
         return [foretold[k] for k in np.flatnonzero(visible)]
 
 

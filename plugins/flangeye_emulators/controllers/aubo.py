@@ -241,7 +241,7 @@ def _numbers(values: Any) -> Floats:
     return np.array(values, dtype=np.float64)
 
 
-def _tell(value: Callable[[AuboController], Any]) -> Method:
+def _method(value: Callable[[AuboController], Any]) -> Method:
     return lambda box, params: value(box)
 
 
@@ -259,34 +259,34 @@ def _set_tool(box: AuboController, params: Mapping[str, Any]) -> int:
 
 
 METHODS: dict[str, Method] = {
-    "getRobotNames": _tell(lambda box: ["rob1"]),
-    "getAxisNames": _tell(lambda box: []),
-    "SystemInfo.getInterfaceVersionCode": _tell(lambda box: 24001),
-    "SystemInfo.getControlSoftwareFullVersion": _tell(lambda box: "0.24.1 (loopback)"),
-    "RobotConfig.getCycletime": _tell(lambda box: box.cycle),
-    "RobotConfig.getDof": _tell(lambda box: len(box.arm.speeds)),
-    "RobotConfig.getTcpOffset": _tell(lambda box: _pose(box.arm.chain.flange_T_tcp)),
+    "getRobotNames": _method(lambda box: ["rob1"]),
+    "getAxisNames": _method(lambda box: []),
+    "SystemInfo.getInterfaceVersionCode": _method(lambda box: 24001),
+    "SystemInfo.getControlSoftwareFullVersion": _method(lambda box: "0.24.1 (loopback)"),
+    "RobotConfig.getCycletime": _method(lambda box: box.cycle),
+    "RobotConfig.getDof": _method(lambda box: len(box.arm.speeds)),
+    "RobotConfig.getTcpOffset": _method(lambda box: _pose(box.arm.chain.flange_T_tcp)),
     "RobotConfig.setTcpOffset": _set_tool,
-    "RobotState.getActualTcpOffset": _tell(lambda box: _pose(box.arm.chain.flange_T_tcp)),
-    "RobotState.getRobotModeType": _tell(lambda box: box.robot_mode),
-    "RobotState.getSafetyModeType": _tell(lambda box: box.safety),
-    "RobotState.isPowerOn": _tell(lambda box: box.robot_mode == "Running"),
-    "RobotState.isSteady": _tell(lambda box: box.arm.standing),
-    "RobotState.getJointPositions": _tell(lambda box: box.arm.stance.joints.tolist()),
-    "RobotState.getJointSpeeds": _tell(lambda box: box.arm.speeds.tolist()),
-    "RobotState.getTcpPose": _tell(lambda box: _pose(box.arm.stance.base_T_tcp)),
-    "RobotState.getToolPose": _tell(lambda box: _pose(_flange(box))),
-    "RobotState.getTcpSpeed": _tell(lambda box: box.arm.twist.tolist()),
-    "RobotState.getTcpForce": _tell(lambda box: box.arm.felt.tolist()),
+    "RobotState.getActualTcpOffset": _method(lambda box: _pose(box.arm.chain.flange_T_tcp)),
+    "RobotState.getRobotModeType": _method(lambda box: box.robot_mode),
+    "RobotState.getSafetyModeType": _method(lambda box: box.safety),
+    "RobotState.isPowerOn": _method(lambda box: box.robot_mode == "Running"),
+    "RobotState.isSteady": _method(lambda box: box.arm.standing),
+    "RobotState.getJointPositions": _method(lambda box: box.arm.stance.joints.tolist()),
+    "RobotState.getJointSpeeds": _method(lambda box: box.arm.speeds.tolist()),
+    "RobotState.getTcpPose": _method(lambda box: _pose(box.arm.stance.base_T_tcp)),
+    "RobotState.getToolPose": _method(lambda box: _pose(_flange(box))),
+    "RobotState.getTcpSpeed": _method(lambda box: box.arm.twist.tolist()),
+    "RobotState.getTcpForce": _method(lambda box: box.arm.felt.tolist()),
     "MotionControl.moveJoint": lambda box, p: box.move_joint(_numbers(p["q"]), p["a"], p["v"]),
     "MotionControl.moveLine": lambda box, p: box.move_line(_numbers(p["pose"]), p["a"], p["v"]),
     "MotionControl.speedLine": lambda box, p: box.speed_line(_numbers(p["xd"]), p["a"], p["t"]),
     "MotionControl.speedJoint": lambda box, p: box.speed_joint(_numbers(p["qd"]), p["a"], p["t"]),
     "MotionControl.stopLine": lambda box, p: box.halt(p["acc"], in_space=True),
     "MotionControl.stopJoint": lambda box, p: box.halt(p["acc"], in_space=False),
-    "MotionControl.getExecId": _tell(lambda box: box.exec_id),
-    "MotionControl.getQueueSize": _tell(lambda box: box.queue_size),
-    "RobotManage.poweroff": _tell(AuboController.power_off),
-    "RobotManage.setUnlockProtectiveStop": _tell(AuboController.unlock),
+    "MotionControl.getExecId": _method(lambda box: box.exec_id),
+    "MotionControl.getQueueSize": _method(lambda box: box.queue_size),
+    "RobotManage.poweroff": _method(AuboController.power_off),
+    "RobotManage.setUnlockProtectiveStop": _method(AuboController.unlock),
 }
 """By name, those of a robot without the robot's name in front."""

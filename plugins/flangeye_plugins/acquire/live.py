@@ -14,12 +14,12 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.devices import (
+    DetectsLoss,
     DeviceError,
     FrameDropped,
-    HearsLoss,
     KnowsTruth,
     MotionAllowed,
-    Overhears,
+    ReceivesScans,
     RobotDriver,
     RobotState,
     Scan,
@@ -58,7 +58,7 @@ from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_plugins.acquire.itinerary import Itinerary, Stop, itinerary_of
 
 
-class Idle:
+class IdleTimer:
     """Measures the time for which the arm was at rest without an exposure, since its first move.
 
     Computations while the arm moves or is scanned cost no session time, and do not count.
@@ -149,7 +149,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
 
     def told(state: RobotState) -> None:
         stage_log("arm", state)
-        if isinstance(opened, HearsLoss):
+        if isinstance(opened, DetectsLoss):
             opened.require_alive()
 
     with ExitStack() as opening:
@@ -267,7 +267,7 @@ class LiveSession:
     done: frozenset[str]
     stage_log: StageLog
     passive: bool = False
-    idle: Idle = field(default_factory=Idle)
+    idle: IdleTimer = field(default_factory=IdleTimer)
 
     def captures(self) -> Iterator[Capture | Rejection]:
         """Yield the captures; the arm moves on while one is transferred and fitted."""
@@ -297,9 +297,9 @@ class LiveSession:
         """Expose at a stop; return a function that waits for the data."""
         began = time.monotonic_ns()
         try:
-            if self.passive and isinstance(self.scanner, Overhears):
+            if self.passive and isinstance(self.scanner, ReceivesScans):
                 began = self._stands_since(arrived_ns)
-                transfer = self.scanner.overhear(began)
+                transfer = self.scanner.received_scan(began)
             else:
                 transfer = self.scanner.expose()
         except FrameDropped as dropped:

@@ -149,7 +149,7 @@ def fitted(points: Singles, shape: Shape, start: Floats, most: int = 12_000) -> 
     """
     if len(points) < FEWEST:
         return None
-    laid = _Laying.of(points, shape, most)
+    laid = _PreparedScan.of(points, shape, most)
     rest = laid.settled(start)
     return rest and laid.fit_of(rest)
 
@@ -167,7 +167,7 @@ class _Settled(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Laying:
+class _PreparedScan:
     """A scan, prepared for fitting a body to it.
 
     Attributes:
@@ -189,7 +189,7 @@ class _Laying:
     prior: Floats
 
     @classmethod
-    def of(cls, points: Singles, shape: Shape, most: int) -> _Laying:
+    def of(cls, points: Singles, shape: Shape, most: int) -> _PreparedScan:
         some, spacing = points[:: 1 + len(points) // most].astype(np.float64), spacing_of(points)
         apart = spacing * float(np.median(some[:, 2]))
         edges, cell = _scan_edges(points, shape.size)

@@ -456,7 +456,7 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
     Position errors are relative to the samples' spread, because dividing all lengths by 1000 also
     divides the errors without explaining anything.
     """
-    before, after = _foretold(session), _foretold(corrected)
+    before, after = _held_out_medians(session), _held_out_medians(corrected)
     # Errors that sound samples have, too: growing up to these is no loss [of the spread, rad]
     none_worse = (after <= np.maximum(1.2 * before, np.array([0.02, 0.01])[: len(after)])).all()
     better = (after <= HELPS * before).any() and none_worse
@@ -465,7 +465,7 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
 
 def explained(session: RecordedSession) -> bool:
     """Return whether the samples predict each other, unlike unrelated ones."""
-    return bool(_foretold(session)[0] <= EXPLAINED)
+    return bool(_held_out_medians(session)[0] <= EXPLAINED)
 
 
 def moved_helps(session: RecordedSession, after: Mask) -> bool:
@@ -497,7 +497,7 @@ def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
     return out
 
 
-def _foretold(session: RecordedSession) -> Floats:
+def _held_out_medians(session: RecordedSession) -> Floats:
     """Return the medians (B,) of held-out errors; positions relative to the samples' spread."""
     errors = held_out_errors(equations_of(session), ~session.seen)
     middle = np.nanmedian(errors, axis=0)

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from flangeye import StageError, part
-from flangeye.estimation.readings import Reading, meant, optical, other_axes
+from flangeye.estimation.readings import Reading, likely, optical, other_axes
 from flangeye.maths.pose_corrections import inverted, reread, scaled, transposed
 from flangeye.types.pose_formats import (
     EULER_ORDERS,
@@ -189,7 +189,7 @@ def direction(session: RecordedSession) -> Findings:
     name, what = "pose direction", f"{whose} {_WAYS[way][1]}"
     fix = corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
-        readings = [_after_inverting(each) for each in _meant(corrected_session)]
+        readings = [_after_inverting(each) for each in _likely_readings(corrected_session)]
         name, what, fix, corrected_session = _choices(session, readings)
     yield evidence.finding(name, what, corrected_session, fix)
 
@@ -203,7 +203,7 @@ def exchanged(session: RecordedSession) -> Findings:
     session.require_poses()
     if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
         raise NotApplicable("camera and target cannot stand for each other")
-    if not explained(session) or Reading() in (readings := _meant(session)):
+    if not explained(session) or Reading() in (readings := _likely_readings(session)):
         return
     carried, standing = _distances(session)
     carried_by = {"target": ("marker", "camera"), "camera": ("camera", "marker")}
@@ -227,7 +227,7 @@ def axes(session: RecordedSession) -> Findings:
     if (found := other_axes(session.centres[session.seen])) is None or not explained(session):
         return
     # What is seen elsewhere because the poses mean something else is no matter of axes
-    if _may_be_mounted_otherwise(session) and Reading() not in _meant(session):
+    if _may_be_mounted_otherwise(session) and Reading() not in _likely_readings(session):
         return
     turn = optical(found)
     read = session.read_with(target={"axes": found})
@@ -318,8 +318,8 @@ def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
     return session.links is None and session.seconds is None and unknown
 
 
-def _meant(session: RecordedSession) -> list[Reading]:
-    return meant(pairs_of(session), *_distances(session), session.robot)
+def _likely_readings(session: RecordedSession) -> list[Reading]:
+    return likely(pairs_of(session), *_distances(session), session.robot)
 
 
 def _after_inverting(reading: Reading) -> Reading:

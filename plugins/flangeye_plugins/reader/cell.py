@@ -117,7 +117,7 @@ class CellParams(Params):
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
+class PoseTable:
     """Recorded poses of one controller.
 
     Attributes:
@@ -188,7 +188,7 @@ def cell(path: Path, params: CellParams) -> Archive:
 # --- reading
 
 
-def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
+def _arms(folder: Path, params: CellParams) -> Iterator[PoseTable]:
     for name, given in params.arms.items():
         text = table_with_rows(folder, given.file)
         found = readings_of(text, given, [*_taken(given), *given.joints])
@@ -198,15 +198,15 @@ def _arms(folder: Path, params: CellParams) -> Iterator[Moved]:
         poses = np.array(found.values)
         poses = poses if given.pose == "base_T_flange" else inverted(poses)
         keys = _keys(text, given.number, found.times)
-        yield Moved(name, text, poses, keys, found.times, given.angles(text))
+        yield PoseTable(name, text, poses, keys, found.times, given.angles(text))
 
 
-def _axes(folder: Path, params: CellParams) -> Iterator[Moved]:
+def _axes(folder: Path, params: CellParams) -> Iterator[PoseTable]:
     for name, given in params.axes.items():
         text = table_with_rows(folder, given.file)
         values = text.numbers([text.index(given.column)])[:, 0] * {**LENGTHS, **ANGLES}[given.unit]
         times = times_of(text, given.time, given.time_unit)
-        yield Moved(name, text, values, _keys(text, given.number, times), times)
+        yield PoseTable(name, text, values, _keys(text, given.number, times), times)
 
 
 def _sightings(folder: Path, params: CellParams) -> Iterator[CameraTable]:
@@ -255,7 +255,7 @@ def _keys(text: Table, number: Column | None, times: Floats | None) -> dict[str,
 # --- joining
 
 
-def _require_one_join(seen: CameraTable, moved: Sequence[Moved]) -> None:
+def _require_one_join(seen: CameraTable, moved: Sequence[PoseTable]) -> None:
     for each in moved:
         if (each.times is None) != (seen.times is None):
             files = (seen.text.file, each.text.file)
@@ -267,14 +267,14 @@ def _require_one_join(seen: CameraTable, moved: Sequence[Moved]) -> None:
 
 
 def _joined(
-    seen: CameraTable, moved: Sequence[Moved], params: PairingParams
+    seen: CameraTable, moved: Sequence[PoseTable], params: PairingParams
 ) -> tuple[list[Recording], list[str]]:
     if seen.times is not None:
         return _by_time(seen, moved, params)
     return list(_by_number(seen, moved)), []
 
 
-def _by_number(seen: CameraTable, moved: Sequence[Moved]) -> Iterator[Recording]:
+def _by_number(seen: CameraTable, moved: Sequence[PoseTable]) -> Iterator[Recording]:
     for key, row in (seen.keys or {}).items():
         for each in moved:
             if key not in (each.keys or {}):
@@ -289,7 +289,7 @@ def _by_number(seen: CameraTable, moved: Sequence[Moved]) -> Iterator[Recording]
 
 
 def _by_time(
-    seen: CameraTable, moved: Sequence[Moved], params: PairingParams
+    seen: CameraTable, moved: Sequence[PoseTable], params: PairingParams
 ) -> tuple[list[Recording], list[str]]:
     """Pair measurements with the first arm's standstills, at which all others must be at rest."""
     first = next((each for each in moved if each.values.ndim == 3), None)
@@ -312,7 +312,7 @@ def _by_time(
     return found, [f"{seen.text.file.name}: {note}" for note in notes]
 
 
-def _moment(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Moment:
+def _moment(first: PoseTable, moved: Sequence[PoseTable], found: MatchedPose) -> Moment:
     at = {each.name: found.pose if each is first else _at(each, found.time) for each in moved}
     joints = {
         m.name: rows_at(found.time, np.asarray(m.times), m.joints)
@@ -322,7 +322,7 @@ def _moment(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Moment:
     return Moment(at, joints, found.time, _motion(first, moved, found))
 
 
-def _motion(first: Moved, moved: Sequence[Moved], found: MatchedPose) -> Motion | None:
+def _motion(first: PoseTable, moved: Sequence[PoseTable], found: MatchedPose) -> Motion | None:
     """Return the motions of all arms, rails and positioners; None if the first was at rest."""
     if found.motion is None or first.times is None:
         return None
@@ -348,14 +348,14 @@ def _signals(arm: Signal, events: Floats, values: Sequence[Floats | Path | None]
     return turning(*arm), turning(events, np.array(whole))
 
 
-def _at(each: Moved, time: float) -> Floats:
+def _at(each: PoseTable, time: float) -> Floats:
     times = np.asarray(each.times)
     if each.values.ndim == 1:
         return rows_at(time, times, each.values)
     return np.asarray(interpolated(times, each.values, np.array([time]))[0])
 
 
-def _stands(each: Moved, found: MatchedPose, events: Floats) -> bool:
+def _stands(each: PoseTable, found: MatchedPose, events: Floats) -> bool:
     """Return whether a carrier is at rest during the measurements of one standstill."""
     half = np.ptp(events[list(found.events)]) / 2
     before, after = (_at(each, found.time + side) for side in (-half, half))

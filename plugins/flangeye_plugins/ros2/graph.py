@@ -298,7 +298,7 @@ class Ros2Graph(Device):
             )
         return str(decoded(latched.data, Type.TEXT).data)
 
-    def _listen(self, topics: Sequence[Topic]) -> list[Heard]:
+    def _listen(self, topics: Sequence[Topic]) -> list[ReceivedTopic]:
         """Return the samples that all topics of arms and cameras sent in a short time."""
         some = [t for t in topics if t.publishers and t.type in (Type.JOINT_STATE, *SCANS)]
         joints: dict[str, dict[str, float]] = {topic.name: {} for topic in some}
@@ -315,7 +315,7 @@ class Ros2Graph(Device):
         before = {topic.name: self._bridge.heard(topic.name) for topic in some}
         time.sleep(self.counted)
         return [
-            Heard(
+            ReceivedTopic(
                 topic,
                 (self._bridge.heard(topic.name) - before[topic.name]) / self.counted,
                 self._bridge.newest(topic.name),
@@ -358,7 +358,7 @@ class Ros2Graph(Device):
         )
 
 
-class Heard(NamedTuple):
+class ReceivedTopic(NamedTuple):
     """What was received on a topic: rate [Hz], newest message, and joint angles by name."""
 
     topic: Topic
@@ -436,7 +436,7 @@ def packages_of(text: str) -> dict[str, Path]:
     return found
 
 
-def states_of(heard: Sequence[Heard], joints: Sequence[str]) -> tuple[str, Floats]:
+def states_of(heard: Sequence[ReceivedTopic], joints: Sequence[str]) -> tuple[str, Floats]:
     """Return the topic with all joints of an arm, and their present angles (n,) [rad].
 
     Among several a topic named joint_states is preferred, as others may contain commands.
@@ -471,7 +471,7 @@ def arm_driver(
     return {"ros2": params | {"trajectory": chosen}}
 
 
-def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
+def scans_of(heard: Sequence[ReceivedTopic], ask: Ask) -> ReceivedTopic:
     """Return the topic of the scans: clouds, else depth images, else images of a printed target.
 
     Raises:
@@ -492,7 +492,7 @@ def scans_of(heard: Sequence[Heard], ask: Ask) -> Heard:
     return every[chosen]
 
 
-def unit_of(scans: Heard) -> list[str]:
+def unit_of(scans: ReceivedTopic) -> list[str]:
     """Return a warning if the newest cloud of a topic is not in metres, the unit of ROS 2."""
     if scans.topic.type != Type.CLOUD or scans.newest is None:
         return []
@@ -512,14 +512,14 @@ def unit_of(scans: Heard) -> list[str]:
     ]
 
 
-def seen_by(scans: Heard) -> Any:
+def seen_by(scans: ReceivedTopic) -> Any:
     """Return the newest image of a topic, (H, W) or (H, W, 3); empty without one."""
     if scans.newest is None:
         return np.zeros((0, 0), np.uint8)
     return np.ascontiguousarray(decoded(scans.newest.data, scans.topic.type, pixels_of))
 
 
-def scanner_driver(scans: Heard, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:
+def scanner_driver(scans: ReceivedTopic, triggers: Iterable[str], ask: Ask) -> dict[str, Any]:
     """Return the parameters of ``scanner.ros2``; a silent topic needs a trigger.
 
     Args:

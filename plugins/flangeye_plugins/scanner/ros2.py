@@ -135,8 +135,8 @@ class Ros2Scanner(OpenScanner):
         """Take the first message stamped from now on; the arm must wait until it has arrived."""
         return self._exposed(time.monotonic_ns(), DeviceError)
 
-    def overhear(self, since_ns: int) -> Callable[[], Scan]:
-        """Take a scan triggered by others, stamped after a given time; see ``Overhears``."""
+    def received_scan(self, since_ns: int) -> Callable[[], Scan]:
+        """Take a scan triggered by others, stamped after a given time; see ``ReceivesScans``."""
         if self._params.trigger:
             return self.expose()
         return self._exposed(since_ns, FrameDropped)
@@ -170,7 +170,7 @@ class Ros2Scanner(OpenScanner):
         return decode
 
     def require_alive(self) -> None:
-        """Raise DeviceError if the bridge has ended; see ``HearsLoss``."""
+        """Raise DeviceError if the bridge has ended; see ``DetectsLoss``."""
         for topic in self._kinds:
             self._bridge.newest(topic)
 

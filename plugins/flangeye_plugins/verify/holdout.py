@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
-from flangeye.estimation.readings import Pairs, Reading, meant, other_axes
+from flangeye.estimation.readings import Pairs, Reading, likely, other_axes
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import CELL, DEFAULT, EVERY, Configuration, mapped_and_expected
 from flangeye.models.robots import RobotModel, SecondRobot
@@ -234,7 +234,7 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
         np.array([o.poses[FLANGE].matrix for o in seen]), markers, carried.child == cell.cameras[0]
     )
     near, far = (float(np.linalg.norm(each.translation)) for each in (carried, standing))
-    readings = meant(pairs, near, far, next(iter(cell.arms.values()), None))
+    readings = likely(pairs, near, far, next(iter(cell.arms.values()), None))
     # Inverted poses fit exactly as well as right ones, so no residual shows them: only the
     # distances of camera and target from what carries them do.
     if Reading() not in readings:

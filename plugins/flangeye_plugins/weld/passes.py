@@ -68,7 +68,7 @@ class RootPass:
         return float(np.interp(s, self._along, self._sigma))
 
 
-class Passes:
+class MultiPassController:
     """Controller of several passes: the root pass by touch, later ones along the felt seam.
 
     Attributes:
@@ -270,7 +270,7 @@ class Passes:
 
 def follower_of(controller: Controller) -> Follower | None:
     """Return the controller that follows by touch (the root pass's); None if there is none."""
-    if isinstance(controller, Passes):
+    if isinstance(controller, MultiPassController):
         return controller.root
     return controller if isinstance(controller, Follower) else None
 

@@ -16,7 +16,7 @@ from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import LARGEST_TURN, TABLE, Barred, Route, Router
 from flangeye.types import Floats, Transform
-from flangeye_plugins.weld.following.task import Onset
+from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path, Place
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
@@ -49,7 +49,7 @@ class Task:
     tool: Tool
     plan: Path
     params: WeldTactileParams
-    start: Onset
+    start: WeldStart
     aside: float = 0.0
 
 

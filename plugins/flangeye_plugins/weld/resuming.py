@@ -23,8 +23,8 @@ from flangeye.workflow.log.read import JournalEntry, read_notes
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.steering import SETTLING
-from flangeye_plugins.weld.following.task import Onset, ResumePoint, WeldTask
-from flangeye_plugins.weld.passes import Passes, follower_of
+from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
+from flangeye_plugins.weld.passes import MultiPassController, follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
 from flangeye_plugins.weld.weld_log import LoggedLooks
@@ -39,7 +39,7 @@ def controller_of(
     settings: Following,
     mode: Mode,
     kept: ResumePoint | None = None,
-    start: Onset | None = None,
+    start: WeldStart | None = None,
 ) -> Controller:
     """Return the controller for a mode; for the other arguments see :class:`WeldTask`."""
     if isinstance(mode, BoundPart):
@@ -47,7 +47,7 @@ def controller_of(
         return controller
     root = Follower(WeldTask(plan, prior, settings, mode == "tactile", kept, start))
     if settings.passes and mode == "tactile":
-        return Passes(root)
+        return MultiPassController(root)
     return root
 
 
@@ -86,7 +86,7 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     plan, kept = Path(np.array(start["points"]), start["wraps"]), start.get("kept")
     before = None if kept is None else _kept_from(kept)
     given = start.get("start")
-    at = None if given is None else Onset(**given)
+    at = None if given is None else WeldStart(**given)
     return controller_of(plan, prior, settings, _mode_of(start["mode"]), before, at)
 
 
@@ -119,7 +119,7 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
         elif again is not None:
             again.take(note)
     controller = None if again is None else again.controller
-    if not isinstance(controller, Follower | Passes):
+    if not isinstance(controller, Follower | MultiPassController):
         raise StageError(f"{log}: holds no tactile weld to resume")
     if controller.phase == "done":
         raise StageError(f"{log}: this weld is complete; there is nothing to resume")
@@ -183,7 +183,7 @@ def _require_same(log: FilePath, points: Floats, before: Floats) -> None:
     )
 
 
-def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> Onset:
+def restart(params: WeldTactileParams, plan: Path, distance: float, kept: ResumePoint) -> WeldStart:
     """Return the start of a resumed weld, such that the torch overlaps the bead.
 
     The arc is struck at the start of the overlap; the tip is set down a run-in before that. A later
@@ -205,13 +205,13 @@ def set_back(params: WeldTactileParams, plan: Path, distance: float, kept: Resum
     return _standing(plan, distance, max(arc_from, 0.0), tip)
 
 
-def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> Onset:
+def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> WeldStart:
     """Return the start with the tip and the torch on the plan, for an arc from ``arc_from`` [m]."""
     place = plan.at(tip)
     torch = plan.at(_away(plan, tip, -distance)).point
     heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
     angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    return Onset(tip, arc_from, angle)
+    return WeldStart(tip, arc_from, angle)
 
 
 def _away(plan: Path, s: float, distance: float) -> float:

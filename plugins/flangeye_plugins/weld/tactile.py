@@ -27,14 +27,14 @@ from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, S
 from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior, body_of, model_prior_of
-from flangeye_plugins.weld.following.task import Onset, ResumePoint
+from flangeye_plugins.weld.following.task import ResumePoint, WeldStart
 from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.prior import keep_posterior, with_prior
 from flangeye_plugins.weld.reachability import SeamReach, Task
 from flangeye_plugins.weld.report import report_of
-from flangeye_plugins.weld.resuming import controller_of, kept_value, resume_point_of, set_back
+from flangeye_plugins.weld.resuming import controller_of, kept_value, restart, resume_point_of
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from flangeye_plugins.weld.weld_log import WeldLog
 
@@ -125,7 +125,7 @@ class Planned:
     tool: Tool
     prior: ModelPrior
     params: WeldTactileParams
-    start: Onset
+    start: WeldStart
     driver: RobotDriver
     gas_after: float | None
     kept: ResumePoint | None
@@ -149,9 +149,9 @@ def _planned(
     checks.check_seam(seam, surface, body.distance, params)
     checks.check_speeds(finger, params, allowed)
     kept = None if params.resume is None else resume_point_of(params.resume, surface.points)
-    start = Onset(params.set_down)
+    start = WeldStart(params.set_down)
     if kept is not None:
-        start = set_back(params, plan, body.distance, kept)
+        start = restart(params, plan, body.distance, kept)
     driver, times = _with_power_source(driver, params)
     if times is not None:
         prior = replace(prior, arc=(times.gas_before, times.ignition, times.crater))

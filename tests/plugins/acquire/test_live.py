@@ -7,7 +7,7 @@ import pytest
 
 from flangeye.motion.supervision import RememberedState
 from flangeye.types.geometry import rigid, rotation_exp
-from flangeye_plugins.acquire.live import Idle, LiveSession, movement, within
+from flangeye_plugins.acquire.live import IdleTimer, LiveSession, movement, within
 
 
 def samples(*times, move=0.0, turn=0.0):
@@ -42,7 +42,7 @@ def test_movement_counts_shifts_and_turns() -> None:
 
 
 def test_an_arm_is_idle_while_it_stands_and_nothing_is_exposed() -> None:
-    idle = Idle()
+    idle = IdleTimer()
     assert idle.share is None
     idle.leaves(100)
     assert idle.share is None

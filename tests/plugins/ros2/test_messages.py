@@ -6,7 +6,7 @@ import pytest
 from flangeye import StageError
 from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.client import GraphMessage
-from flangeye_plugins.ros2.graph import Heard, unit_of
+from flangeye_plugins.ros2.graph import ReceivedTopic, unit_of
 from flangeye_plugins.ros2.messages import (
     Type,
     cloud_of,
@@ -66,7 +66,9 @@ def test_init_warns_of_a_cloud_that_is_not_in_metres(scale, said):
     points = np.vstack([scale * XYZ.reshape(-1, 3)[:3], np.zeros((3, 3))]).astype("<f4")
     given.data = points.view(np.uint8).ravel()
     newest = GraphMessage(1, 0, 0, encoded(given))
-    warnings = unit_of(Heard(Topic("/eye/points", Type.CLOUD, ("eye",), 0), 10.0, newest, {}))
+    warnings = unit_of(
+        ReceivedTopic(Topic("/eye/points", Type.CLOUD, ("eye",), 0), 10.0, newest, {})
+    )
     assert len(warnings) == (said is not None)
     assert all(line.startswith("warning: /eye/points: ") and said in line for line in warnings)
 

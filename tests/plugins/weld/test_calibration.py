@@ -16,7 +16,7 @@ from flangeye.models.model import read_model
 from flangeye.types import Floats, Image
 from flangeye.types.geometry import nearest_rotation, rigid, rotation_exp
 from flangeye_plugins.weld.finger_camera import FingerReader
-from flangeye_plugins.weld.touch.calibration import Held, calibrate
+from flangeye_plugins.weld.touch.calibration import HeldReading, calibrate
 from flangeye_plugins.weld.touch.pivot import pivot
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter
@@ -30,11 +30,11 @@ def reading(place: Any, turn: Any = (0.0, 0.0, 0.1)) -> TagReading:
     return TagReading(np.array(place), np.array(turn), np.eye(3) * 1e-10, 1.0, np.zeros((4, 2)))
 
 
-def held(tip: Any, off: Any = (0.0, 0.0, 0.0), force: Any = None) -> Held:
+def held(tip: Any, off: Any = (0.0, 0.0, 0.0), force: Any = None) -> HeldReading:
     """A reading of a tip that is displaced so, but for what it is off by [m, N]."""
     tip = np.array(tip)
     tag = REST + np.linalg.solve(GAIN, tip - off)
-    return Held(reading(tag), tip, None if force is None else np.array(force))
+    return HeldReading(reading(tag), tip, None if force is None else np.array(force))
 
 
 def moves(size: float = 2e-3, up: float = 2e-3) -> list[Floats]:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.following.contact import Contact, Felt, Mode
+from flangeye_plugins.weld.following.contact import Contact, ContactMeasurement, Mode
 
 NOISE = (20e-6, 120e-6)
 FLAT = math.tan(math.radians(40.0))
@@ -30,7 +30,7 @@ class Tip:
             self.k += 1
             across, high = self.rng.standard_normal(2) * self.found.noise
             self.found.take(
-                Felt(self.k / 30, self.k * 0.2e-3, 5e-3, 0.1, aside + across,
+                ContactMeasurement(self.k / 30, self.k * 0.2e-3, 5e-3, 0.1, aside + across,
                      self.spread**2 + self.found.noise[0] ** 2, up + high,
                      deflection + across, compression), side,
             )  # fmt: skip

@@ -17,9 +17,9 @@ from flangeye_plugins.weld.following.bound import along
 from flangeye_plugins.weld.following.contact import Mode, only
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
-from flangeye_plugins.weld.following.sensing import Located, SeamReading
+from flangeye_plugins.weld.following.sensing import SeamReading, TipPosition
 from flangeye_plugins.weld.following.steering import WeaveOffset
-from flangeye_plugins.weld.following.task import Onset, ResumePoint, WeldTask
+from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
@@ -158,8 +158,8 @@ def test_the_torch_is_lit_where_it_is_known_and_then_has_to_stay_so() -> None:
     assert doubtful(0.01, None, off=0.0).arc_from == 0.01
     assert doubtful(0.02, 0.01, off=0.0).arc_from == 0.01
     assert doubtful(-0.01, None, off=0.0).arc_from is None  # it is not on the seam yet
-    assert doubtful(0.01, None, off=0.0, start=Onset(5e-3, 15e-3)).arc_from is None
-    assert doubtful(0.016, None, off=0.0, start=Onset(5e-3, 15e-3)).arc_from == 0.016
+    assert doubtful(0.01, None, off=0.0, start=WeldStart(5e-3, 15e-3)).arc_from is None
+    assert doubtful(0.016, None, off=0.0, start=WeldStart(5e-3, 15e-3)).arc_from == 0.016
     assert doubtful(0.01, None, off=0.0, phase="probing").arc_from is None
     stopped = doubtful(0.02, 0.01)
     assert stopped.phase == "stopped" and stopped.arc_from == 0.01
@@ -173,8 +173,8 @@ def test_a_weld_that_cannot_begin_within_the_first_hundredth_of_the_seam_is_refu
     told = doubtful(0.0031, None, plan=long)
     assert told.phase == "stopped" and told.arc_from is None and told.welding.share == 0.0
     assert told.reason.startswith("not begun: the torch is known to 3.")
-    assert doubtful(0.0178, None, plan=long, start=Onset(5e-3, 15e-3)).phase == "following"
-    assert doubtful(0.0179, None, plan=long, start=Onset(5e-3, 15e-3)).phase == "stopped"
+    assert doubtful(0.0178, None, plan=long, start=WeldStart(5e-3, 15e-3)).phase == "following"
+    assert doubtful(0.0179, None, plan=long, start=WeldStart(5e-3, 15e-3)).phase == "stopped"
 
 
 def test_a_weld_is_not_begun_where_the_seam_ahead_is_not_known() -> None:
@@ -259,7 +259,7 @@ def test_the_tip_goes_back_slowly_where_it_is_seen_late() -> None:
 
 
 def test_the_share_that_was_welded_is_of_the_planned_seam() -> None:
-    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), start=Onset(5e-3, 10e-3))
+    found = doubtful(0.02, 0.01, off=0.0, plan=straight(0.21), start=WeldStart(5e-3, 10e-3))
     assert found.welding.share == pytest.approx(0.05)
     found.progress.torch = 0.22  # the arc ends where the seam does
     assert found.welding.share == pytest.approx(1.0)
@@ -576,7 +576,7 @@ def test_a_seam_that_has_moved_by_two_tenths_since_the_stop_is_another_one(
     found = make(before=ResumePoint(samples, 0.03)).seam
 
     def compared(at: float, offset: float) -> str:
-        return str(found.moved(Located(at, SeamReading(offset, 0.0), 0.0, 0.0, 0.0)))
+        return str(found.moved(TipPosition(at, SeamReading(offset, 0.0), 0.0, 0.0, 0.0)))
 
     for i in range(14):
         assert not compared(0.02 + 1e-4 * i, 1e-3 + moved + (5e-3 if i % 3 == 0 else 0.0))
@@ -643,7 +643,7 @@ def test_phases_follow_from_what_was_felt() -> None:
 
 def felt_at(found: Any, time: float, s: float, offset: float, deflection: float = PRESS) -> None:
     """What the follower does with a touch at an arc length."""
-    at = Located(s, SeamReading(offset, 0.0), deflection, 1.5e-3, 0.1)
+    at = TipPosition(s, SeamReading(offset, 0.0), deflection, 1.5e-3, 0.1)
     found.sensing.take = lambda touch, now: (pose(s), touch)
     found.sensing.locate = lambda *given: at
     found._feel(Touch(time, np.zeros(3)))
@@ -884,7 +884,7 @@ def test_a_cycle_takes_what_was_not_given_before() -> None:
         found.sensing._level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         found.step(pose(0.05, time=3.0), [])
         found.sensing.smooth = found.sensing.seek = None
-        at = Located(0.05, SeamReading(0.0, 0.0), 0.0, 0.0, 0.0)
+        at = TipPosition(0.05, SeamReading(0.0, 0.0), 0.0, 0.0, 0.0)
         found.sensing.locate = lambda _, touch, phase, felt=felt, at=at: felt.append(touch) or at
         touch = Touch(3.05, np.array([1e-3, 2e-3, 3e-3]))
         found.step(pose(0.05, time=3.1), [Touch(2.9, np.zeros(3)), Touch(3.0, np.zeros(3)), touch])
@@ -954,7 +954,7 @@ def test_a_swing_begins_on_the_seam_and_is_commanded_as_early_as_the_arm_is_late
     assert found.lead.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.5))
     early = turn * 0.6
     assert now.aside == pytest.approx(2e-3 * (math.sin(early) + 0.05 * turn * math.cos(early)))
-    later = make(weave_width="4 mm", start=Onset(5e-3, 10e-3))
+    later = make(weave_width="4 mm", start=WeldStart(5e-3, 10e-3))
     for coming, swings in ((9.9e-3, False), (10.1e-3, True)):
         swing(put(later, coming=coming), 1.0)
         assert (later.lead._swings is not None) == swings

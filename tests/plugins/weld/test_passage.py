@@ -14,7 +14,7 @@ from flangeye_emulators.finger.sensor import (
     SimulatedFingerParams,
     sensor_simulated_finger,
 )
-from flangeye_plugins.weld.following.task import Onset
+from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.reachability import JUMP, ROOM, SeamReach, Task
 from flangeye_plugins.weld.settings import WeldTactileParams
@@ -30,7 +30,7 @@ def task_of(name, angle: float = 0.0):
     surface = WorkSurface(seam.points_in_base, seam.openings_in_base)
     limits = LimitsSection.model_validate({"box": BOX}).for_robot(model)
     settings = WeldTactileParams(sensor=SENSOR)
-    start = Onset(settings.set_down, angle=angle)
+    start = WeldStart(settings.set_down, angle=angle)
     return Task(model, limits, FINGER, Tool(FINGER, surface), surface.path, settings, start)
 
 

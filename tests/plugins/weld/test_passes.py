@@ -12,8 +12,8 @@ import pytest
 from flangeye.motion.seam_following import STILL, Command, ToolPose
 from flangeye.types import Floats
 from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
-from flangeye_plugins.weld.following.task import Onset, ResumePoint, WeldTask
-from flangeye_plugins.weld.passes import Passes, RootPass, _nearest, _towards
+from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
+from flangeye_plugins.weld.passes import MultiPassController, RootPass, _nearest, _towards
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
@@ -63,7 +63,7 @@ def passes(
     plan = Path(straight(LENGTH) if points is None else points)
     root: Any = Root(plan, aside)
     root.task = WeldTask(plan, ModelPrior(DISTANCE), settings, before=before, given=start)
-    return Passes(root)
+    return MultiPassController(root)
 
 
 def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: float = 0.0) -> Any:
@@ -284,7 +284,7 @@ def test_a_later_pass_is_gone_on_with_where_it_was() -> None:
     kept = first.kept()
     assert kept.number == 1 and kept.torch == pytest.approx(0.03)
     assert kept.traced == pytest.approx(np.array(first._traced.rows))
-    again = passes({}, {"across": "1 mm"}, before=kept, start=Onset(0.06, 25e-3))
+    again = passes({}, {"across": "1 mm"}, before=kept, start=WeldStart(0.06, 25e-3))
     assert again.number == 1 and again.phase == "returning"
     assert again.torch == again._start == pytest.approx(25e-3)
     assert again.root.sensing.learned == kept.learned and again.arc_from == 25e-3

@@ -18,7 +18,7 @@ from flangeye.units import parse_quantity
 from flangeye.workflow.recipe.find import find_recipe
 from flangeye.workflow.recipe.load import load_recipe
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
-from flangeye_plugins.guide import ATTITUDES, Pivoted, guide_tool, with_body
+from flangeye_plugins.guide import ATTITUDES, ToolPoints, guide_tool, with_body
 from flangeye_plugins.weld.following.model_prior import body_of, model_prior_of
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.pivot import Pivot, pivot
@@ -83,7 +83,7 @@ def test_the_covariance_goes_into_the_welds_bound() -> None:
     finger = read_model(Path("data/fingers/srm.yaml").absolute(), Finger)
     tip = Pivot(TIP, np.diag([0.1e-3, 0.2e-3, 0.3e-3]) ** 2, np.zeros(3), 0.0)
     torch = Pivot(TORCH, np.diag([0.2e-3, 0.1e-3, 0.3e-3]) ** 2, np.zeros(3), 0.0)
-    found = with_body(finger, Pivoted(tip, torch))
+    found = with_body(finger, ToolPoints(tip, torch))
     settings = Following()
     body = body_of(found, settings)
     np.testing.assert_allclose(

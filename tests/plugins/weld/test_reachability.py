@@ -16,7 +16,7 @@ from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import LARGEST_TURN, Barred, Route
 from flangeye_plugins.weld import reachability
-from flangeye_plugins.weld.following.task import Onset
+from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import Barrier, SeamReach, Station, _stations, flange_speed
@@ -286,7 +286,7 @@ def test_the_seam_is_looked_at_from_above_its_start_to_where_the_torch_comes_to_
     plan = surface.path
     params: Any = SimpleNamespace(clearance=15e-3, overlapping=lambda plan: 0.0)
     task: Any = SimpleNamespace(plan=plan, params=params, tool=tool, aside=2e-3, finger=FINGER,
-                                start=Onset(5e-3, angle=angle))  # fmt: skip
+                                start=WeldStart(5e-3, angle=angle))  # fmt: skip
     stations = _stations(task)
     poses = [tool.pose(station.pose, 0.0) for station in stations]
     places = np.array([pose.position for pose in poses])

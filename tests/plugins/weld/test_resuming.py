@@ -15,9 +15,9 @@ from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.frame import WorkSurface
-from flangeye_plugins.weld.passes import Passes
+from flangeye_plugins.weld.passes import MultiPassController
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.resuming import RUN_IN, controller_of, resume_point_of, set_back
+from flangeye_plugins.weld.resuming import RUN_IN, controller_of, restart, resume_point_of
 from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
 from tests.plugins.weld.bench import DISTANCE, World, curved, straight
 from tests.plugins.weld.cell import planned, run, true_line
@@ -111,7 +111,7 @@ PARAMS = WeldTactileParams(sensor=BoundPart(sensor_simulated_finger, SimulatedFi
 
 def test_the_rest_of_a_plan_is_where_both_tip_and_torch_are_on_it() -> None:
     plan = Path(curved(0.15))
-    start = set_back(PARAMS, plan, 0.04, ResumePoint(np.zeros((0, 4)), 0.06))
+    start = restart(PARAMS, plan, 0.04, ResumePoint(np.zeros((0, 4)), 0.06))
     tip, torch = plan.at(start.tip).point, plan.at(0.03 - RUN_IN).point
     assert np.linalg.norm(tip - torch) == pytest.approx(0.04, abs=0.6e-3)
     assert start.torch == pytest.approx(0.03)
@@ -122,7 +122,7 @@ def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
     plan, felt = Path(line), np.zeros((200, 5))
     felt[:, 0], felt[:, 3] = np.linspace(0.11, 0.21, 200), 1.0
     kept = ResumePoint(felt, 0.17)
-    start = set_back(PARAMS, plan, DISTANCE, kept)
+    start = restart(PARAMS, plan, DISTANCE, kept)
     task = WeldTask(plan, ModelPrior(DISTANCE), PARAMS, before=kept, given=start)
     follower = Follower(task)
     World(line, line, follower, PARAMS, start=start.tip).run()
@@ -138,16 +138,16 @@ def test_a_weld_goes_on_no_nearer_to_its_end_than_the_tip_can_press() -> None:
     plan = Path(straight(0.2))
     release = PARAMS.speed * PARAMS.deflection / PARAMS.release
     last = 0.2 - PARAMS.ending - release - 5e-3
-    late = set_back(PARAMS, plan, DISTANCE, kept_at(0.199))
+    late = restart(PARAMS, plan, DISTANCE, kept_at(0.199))
     assert late.tip == pytest.approx(last)
     assert late.torch == pytest.approx(0.199 - PARAMS.overlap)
-    before = set_back(PARAMS, plan, DISTANCE, kept_at(0.1))
+    before = restart(PARAMS, plan, DISTANCE, kept_at(0.1))
     assert before.tip == pytest.approx(0.1 - PARAMS.overlap - RUN_IN + DISTANCE, abs=0.6e-3)
     assert pytest.approx(16e-3) == RUN_IN
-    begun = set_back(PARAMS, plan, DISTANCE, kept_at(1e-3))
+    begun = restart(PARAMS, plan, DISTANCE, kept_at(1e-3))
     assert begun.tip == pytest.approx(PARAMS.inset, abs=0.5e-3) and begun.torch == 0.0
     with pytest.raises(StageError, match="too short for the tip to press on"):
-        set_back(PARAMS, Path(straight(PARAMS.inset + 0.2 - last - 1e-3)), DISTANCE, kept_at(0.01))
+        restart(PARAMS, Path(straight(PARAMS.inset + 0.2 - last - 1e-3)), DISTANCE, kept_at(0.01))
 
 
 @pytest.mark.parametrize("heading", [0.0, 3.0, -3.0])
@@ -159,7 +159,7 @@ def test_on_a_bend_the_tool_is_set_down_along_the_chord_from_torch_to_tip(headin
     half = np.arcsin(DISTANCE / 2 / radius)  # the chord's angle to the circle
     for number in (0, 1):
         params = PARAMS.model_copy(update={"passes": (PassParams(),)})
-        start = set_back(params, plan, DISTANCE, kept_at(0.1, number))
+        start = restart(params, plan, DISTANCE, kept_at(0.1, number))
         assert start.angle == pytest.approx(-half, abs=0.02)
         assert start.torch == pytest.approx(0.07)
         run_in = RUN_IN if not number else 0.0
@@ -170,7 +170,7 @@ def test_later_passes_follow_a_weld_by_touch_alone() -> None:
     plan, settings = Path(straight()), Following.model_validate({"passes": [{}]})
     alone = Following.model_validate({})
     for mode, asked, kind in (
-        ("tactile", settings, Passes), ("vision", settings, Follower), ("tactile", alone, Follower),
+        ("tactile", settings, MultiPassController), ("vision", settings, Follower), ("tactile", alone, Follower),
     ):  # fmt: skip
         given: Mode = mode
         controller = controller_of(plan, ModelPrior(DISTANCE), asked, given)

@@ -19,15 +19,15 @@ from flangeye_plugins.weld.corners import corners_of, leg_of
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior, body_of
 from flangeye_plugins.weld.following.sensing import Track
-from flangeye_plugins.weld.following.task import Onset, ResumePoint
+from flangeye_plugins.weld.following.task import ResumePoint, WeldStart
 from flangeye_plugins.weld.joint import JointKind, WeldJoint, edges_half_angle, joint_of
-from flangeye_plugins.weld.passes import Passes
+from flangeye_plugins.weld.passes import MultiPassController
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import (
     _away,
     _require_same,
     controller_of,
-    set_back,
+    restart,
     task_of,
 )
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
@@ -43,9 +43,9 @@ def params(**given: Any) -> WeldTactileParams:
     return WeldTactileParams.model_validate({"sensor": SENSOR, **given})
 
 
-def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> Onset:
+def again(torch: float, plan: Any = None, number: int = 0, **given: Any) -> WeldStart:
     path = Path(straight(0.3) if plan is None else plan)
-    return set_back(
+    return restart(
         params(**given), path, DISTANCE, ResumePoint(np.zeros((0, 5)), torch, number=number)
     )
 
@@ -119,7 +119,7 @@ def test_the_controller_is_the_one_that_was_asked_for() -> None:
     tactile, vision = (controller_of(plan, prior, root, mode) for mode in ("tactile", "vision"))
     assert isinstance(tactile, Follower) and tactile.mode == "tactile"
     assert isinstance(vision, Follower) and vision.mode == "vision"
-    assert isinstance(controller_of(plan, prior, more, "tactile"), Passes)
+    assert isinstance(controller_of(plan, prior, more, "tactile"), MultiPassController)
     assert isinstance(controller_of(plan, prior, more, "vision"), Follower)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         task = task_of(plan, DISTANCE, Following.model_validate({"side": side}))

@@ -23,7 +23,7 @@ from flangeye_plugins.sensor import (
     sensor_mcap,
     sensor_opencv,
 )
-from flangeye_plugins.weld.touch.calibration import Held, calibrate
+from flangeye_plugins.weld.touch.calibration import HeldReading, calibrate
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter
 
@@ -121,7 +121,7 @@ def places():
 def readings(eye, force=None):
     rest = [r for _ in range(20) if (r := eye.reading(np.zeros(3)))]
     held = [
-        Held(r, place, None if force is None else force * -place)
+        HeldReading(r, place, None if force is None else force * -place)
         for place in places()
         for _ in range(3)
         if (r := eye.reading(place))
@@ -153,7 +153,7 @@ def test_what_no_calibration_can_be_made_of() -> None:
     with pytest.raises(StageError, match="did not move the finger along all three axes"):
         calibrate(rest, flat, "")
     slid = [
-        Held(h.reading, h.displacement * rng)
+        HeldReading(h.reading, h.displacement * rng)
         for h, rng in zip(held, np.tile([1, 3], 99), strict=False)
     ]
     with pytest.raises(StageError, match="did the tip slide in its mark"):

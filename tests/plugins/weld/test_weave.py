@@ -9,7 +9,7 @@ import pytest
 from flangeye.errors import StageError
 from flangeye_plugins.weld.checks import check_weave
 from flangeye_plugins.weld.following.steering import Weave, WeaveOffset
-from flangeye_plugins.weld.passes import Passes, follower_of
+from flangeye_plugins.weld.passes import MultiPassController, follower_of
 from flangeye_plugins.weld.resuming import controller_from
 from flangeye_plugins.weld.settings import Following
 from tools.weld_bench import curved, misplanned, try_condition
@@ -110,7 +110,7 @@ def test_passes_are_decided_again_from_what_a_log_holds() -> None:
         controller.step = heard
 
     found = try_condition(asked, 0, 0.06, PERIOD, listening)
-    assert isinstance(found.controller, Passes)
+    assert isinstance(found.controller, MultiPassController)
     root = follower_of(found.controller)
     start = {
         "points": misplanned(curved(0.06), 0, *asked.planned).tolist(), "wraps": 0.0, "mode": "tactile",

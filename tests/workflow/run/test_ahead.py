@@ -14,7 +14,7 @@ from flangeye.plugin.registry import Registry, load_registry
 from flangeye.workflow.recipe.find import find_recipe
 from flangeye.workflow.recipe.load import load_recipe, parse_recipe
 from flangeye.workflow.run import runner
-from flangeye.workflow.run.ahead import Done, cores, worked_ahead
+from flangeye.workflow.run.ahead import FinishedCall, cores, worked_ahead
 from flangeye.workflow.run.runner import Runner
 from flangeye_emulators.acquire import simulated
 from flangeye_emulators.world.scanner import StructuredLight
@@ -66,14 +66,14 @@ def test_as_many_are_begun_as_there_are_workers_and_one_waits() -> None:
 def test_a_call_takes_the_time_from_its_begin_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([10.0, 12.5])
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    assert Done.of(lambda: 7) == Done(7, None, 2.5)
+    assert FinishedCall.of(lambda: 7) == FinishedCall(7, None, 2.5)
 
 
 def test_what_was_raised_is_raised_when_it_is_asked_for() -> None:
     def fail():
         raise ValueError("no")
 
-    done = Done.of(fail)
+    done = FinishedCall.of(fail)
     with pytest.raises(ValueError, match="no"):
         done.result()
 

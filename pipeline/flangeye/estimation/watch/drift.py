@@ -137,7 +137,7 @@ class Information:
         matrix = np.asarray(np.linalg.inv(covariance))
         return cls(matrix, matrix @ np.broadcast_to(mean, len(matrix)))
 
-    def loosened(self, deviation: float) -> Information:
+    def after_unknown_motion(self, deviation: float) -> Information:
         """Return the information after an unknown camera motion; see ``allowance``."""
         covariance = self.covariance
         covariance[:6, :6] += allowance(deviation)
@@ -229,7 +229,7 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
     n = len(checks.matrix)
     # A step is held against a calibration that the seasons may have moved. Slow drift is that
     # motion itself, so nothing is allowed for it in `_slow`
-    start = Prior(prior.information.loosened(test.seasonal), prior.freedom)
+    start = Prior(prior.information.after_unknown_motion(test.seasonal), prior.freedom)
     found = max((_step(checks, start, n - w, test) for w in _windows(n, test)), key=lambda s: s[0])
     if found[0] > 1.0:
         return moved_since(checks, prior, corners, test, found[1], found[0])
@@ -247,7 +247,7 @@ def moved_since(
     checks: Information, prior: Prior, corners: Floats, test: DriftTest, since: int, ratio: float
 ) -> DriftVerdict:
     """Return the camera's motion between the checks before ``since`` and those after it."""
-    start = prior.information.loosened(test.seasonal)
+    start = prior.information.after_unknown_motion(test.seasonal)
     before = start.plus(checks.summed(max(since - test.reference, 0), since))
     change = _change(checks.summed(since, len(checks.matrix)), before)
     shift = largest_shift(change.mean, corners)

@@ -206,7 +206,7 @@ class BatchProgress:
 
         self._console = console
         self._counts: Counter[Status] = Counter()
-        self._told = 0
+        self._printed = 0
         self._progress = progress.Progress(
             progress.BarColumn(), progress.MofNCompleteColumn(),
             progress.TextColumn("{task.description}"),
@@ -230,16 +230,16 @@ class BatchProgress:
         """Count the sessions of a chunk, and print the first errors."""
         self._counts.update(told.counts)
         for session, outcome in told.bad:
-            self._tell(session, outcome)
+            self._print_failure(session, outcome)
         done = told.counts.total()
         self._progress.update(self._task, advance=done, description=count_text(self._counts))
 
-    def _tell(self, session: str, outcome: SessionOutcome) -> None:
-        self._told += 1
+    def _print_failure(self, session: str, outcome: SessionOutcome) -> None:
+        self._printed += 1
         most = 10  # named while the batch runs; the tables name all
-        if self._told <= most:
+        if self._printed <= most:
             self.note(f"{outcome.status} {session}: {outcome.reason}")
-        elif self._told == most + 1:
+        elif self._printed == most + 1:
             self.note("further ones will be in sessions.csv")
 
 

@@ -16,7 +16,7 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
-class Done:
+class FinishedCall:
     """A finished call: its result or exception, and its duration.
 
     Attributes:
@@ -30,7 +30,7 @@ class Done:
     seconds: float
 
     @classmethod
-    def of(cls, call: Callable[[], Any]) -> Done:
+    def of(cls, call: Callable[[], Any]) -> FinishedCall:
         """Make a call and return it with its result or exception."""
         start = time.perf_counter()
         try:
@@ -65,7 +65,7 @@ def worked_ahead(
     pool = ThreadPoolExecutor(workers, thread_name_prefix="flangeye")
     waiting: deque[tuple[Item, Future[Made]]] = deque()
     try:
-        while (pulled := Done.of(partial(next, items))).error is None:
+        while (pulled := FinishedCall.of(partial(next, items))).error is None:
             waiting.append((pulled.value, pool.submit(work, pulled.value)))
             while waiting and (len(waiting) > workers or waiting[0][1].done()):
                 yield _first(waiting)

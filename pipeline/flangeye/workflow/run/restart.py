@@ -34,7 +34,7 @@ class _Named(Protocol):
 Each = TypeVar("Each", bound=_Named)
 
 
-class Gathered(NamedTuple):
+class EarlierCapture(NamedTuple):
     """A capture of an earlier run, with that run's results for it."""
 
     capture: t.Capture
@@ -85,7 +85,7 @@ class FromNothing:
         """Return the captures rejected by steps that are not repeated."""
         return []
 
-    def gathered(self) -> Iterator[Gathered]:
+    def gathered(self) -> Iterator[EarlierCapture]:
         """Return the captures of an earlier run, to be logged again."""
         return iter(())
 
@@ -229,13 +229,13 @@ class FromEarlierRun(FromNothing):
         """Return the earlier run's rejected captures, except those taken again."""
         return [r for r in self.log.rejections if r.id not in self.retaken]
 
-    def gathered(self) -> Iterator[Gathered]:
+    def gathered(self) -> Iterator[EarlierCapture]:
         """Return the earlier run's captures, so that the new log is complete in itself."""
         fitted = {o.id: o for o in self.log.observations()}
         unsegmented = ((capture, None) for capture in self.log.captures())
         for capture, flange in self.log.flange_clouds() if self.segments else unsegmented:
             if capture.id not in self.retaken:
-                yield Gathered(capture, flange, fitted.get(capture.id))
+                yield EarlierCapture(capture, flange, fitted.get(capture.id))
 
 
 def restart_at(log: RunLog, recipe: Recipe, at: str, left_out: Collection[str] = ()) -> FromLog:

@@ -30,7 +30,7 @@ from flangeye.workflow.recipe.load import Recipe
 from flangeye.workflow.recipe.steps import Step, bare
 from flangeye.workflow.result import calibrated_pose, require_one
 from flangeye.workflow.result.contract import Result
-from flangeye.workflow.run.ahead import Done, cores, worked_ahead
+from flangeye.workflow.run.ahead import FinishedCall, cores, worked_ahead
 from flangeye.workflow.run.outcome import Outcome, Stopwatch, Truths, result_of
 from flangeye.workflow.run.restart import FromNothing
 
@@ -59,7 +59,7 @@ class Runner:
         self._held: list[list[t.Observation]] = []
         self._captures: t.Captures | None = None
         self._working: Generator[t.Capture | t.Rejection] | None = None
-        self._done: Callable[[], dict[str, Done]] = dict
+        self._done: Callable[[], dict[str, FinishedCall]] = dict
 
     def run(self, start: FromNothing = FromNothing()) -> Result:  # noqa: B008  holds nothing
         """Run the recipe and return its result.
@@ -256,16 +256,16 @@ class Runner:
             for capture, self._done in working:
                 yield capture
 
-    def _meanwhile(self, capture: t.Capture | t.Rejection) -> dict[str, Done]:
+    def _meanwhile(self, capture: t.Capture | t.Rejection) -> dict[str, FinishedCall]:
         """Return the results of segment and fit for a capture, by label; runs in any thread."""
         if isinstance(capture, t.Rejection) or _unread_joint(capture) is not None:
             return {}
-        found: dict[str, Done] = {}
+        found: dict[str, FinishedCall] = {}
         given: dict[Any, Any] = {t.Capture: capture}
         for step in (*self._steps("segment"), *self._steps("fit")):
             if step.stage.kind == "fit" and capture.role == "verification":
                 break
-            done = Done.of(partial(_guarded, step, self._arguments(step, given)))
+            done = FinishedCall.of(partial(_guarded, step, self._arguments(step, given)))
             found[step.label] = done
             if not isinstance(done.value, t.FlangeCloud):
                 break

@@ -52,7 +52,7 @@ RARE = 1e-3
 """Probability, per STRIDE, that a lightly pressed tip climbs."""
 
 
-class Felt(NamedTuple):
+class ContactMeasurement(NamedTuple):
     """A measurement, compared with the one expected of a seated tip [m].
 
     Attributes:
@@ -78,7 +78,7 @@ class Felt(NamedTuple):
     compression: float
 
 
-class _Weighed(NamedTuple):
+class _WeighedMeasurement(NamedTuple):
     """A measurement, and its likelihood in each mode.
 
     Attributes:
@@ -89,7 +89,7 @@ class _Weighed(NamedTuple):
         climbed: Height that the tip has risen, if it has climbed [m].
     """
 
-    felt: Felt
+    felt: ContactMeasurement
     likely: Floats
     moves: Floats
     chances: Floats
@@ -127,7 +127,7 @@ class Contact:
         self._flat, self._slides, self._preload = flat, slides, preload
         self._time, self.at = -math.inf, math.inf
         self._height, self._spread = 0.0, math.inf
-        self._newest: deque[_Weighed] = deque()
+        self._newest: deque[_WeighedMeasurement] = deque()
         self.fell: float | None = None
         self._borne: tuple[float, float] | None = None
 
@@ -158,7 +158,7 @@ class Contact:
         stands = self.steady * max(self.compression, 1e-9)
         return abs(self.deflection) / stands
 
-    def take(self, felt: Felt, side: float) -> None:
+    def take(self, felt: ContactMeasurement, side: float) -> None:
         """Update the modes' probabilities by a measurement; ``side`` is the pressed wall."""
         # Deflection and compression are filtered over 0.1 s.
         kept = math.exp(-(felt.time - self._time) / 0.1)
@@ -174,7 +174,7 @@ class Contact:
         chances, climbed = self._chances(felt, side)
         weighed = (self.likely @ moves) * chances
         self.likely = weighed / weighed.sum()
-        self._newest.append(_Weighed(felt, self.likely, moves, chances, climbed))
+        self._newest.append(_WeighedMeasurement(felt, self.likely, moves, chances, climbed))
         # Only a seated tip measures the height of the seam
         gain = float(self.likely[Mode.SEATED]) * self._spread / (self._spread + self.noise[1] ** 2)
         self._height += gain * (felt.height - self._height)
@@ -184,7 +184,7 @@ class Contact:
         """Drop the measurements not yet used, which were made while no wall held the tip."""
         self._newest.clear()
 
-    def settled(self, until: float) -> Iterator[tuple[Felt, float]]:
+    def settled(self, until: float) -> Iterator[tuple[ContactMeasurement, float]]:
         """Yield valid measurements up to a time [s], each with its extra variance [m^2]."""
         # Backward pass: `since` is the likelihood of all later measurements, given each mode
         since, off = np.ones(len(Mode)), []
@@ -226,7 +226,7 @@ class Contact:
         moves[Mode.SEATED, Mode.SEATED] -= climbing + 2.0 * share * RARE * 10.0
         return moves
 
-    def _chances(self, felt: Felt, side: float) -> tuple[Floats, float]:
+    def _chances(self, felt: ContactMeasurement, side: float) -> tuple[Floats, float]:
         """Return a measurement's likelihood in each mode (5,), and the height climbed [m]."""
         up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
         # Tack welds lift the tip on 10 % of a seam; 2 % of a seam bend in a way not planned.

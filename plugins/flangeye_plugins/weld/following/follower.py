@@ -18,7 +18,7 @@ from flangeye_plugins.weld.following.response import Response
 from flangeye_plugins.weld.following.sensing import SeamEstimate, SeamReading, Sensing
 from flangeye_plugins.weld.following.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
-from flangeye_plugins.weld.following.tip import Advance, Pressing, within
+from flangeye_plugins.weld.following.tip import DeflectionTarget, SeamProgress, within
 from flangeye_plugins.weld.following.welding import Welding
 from flangeye_plugins.weld.settings import INSIDE
 
@@ -47,7 +47,7 @@ class Follower:
         """Prepare to follow a seam."""
         self.phase: Phase = "seeking" if task.touch else "following"
         self.reason, self.task = "", task
-        self.progress, self.pressing = Advance(task), Pressing(task)
+        self.progress, self.pressing = SeamProgress(task), DeflectionTarget(task)
         self.sensing = Sensing(task, self.progress, self.pressing)
         self.seam, self.lead, self.arm = SeamEstimate(task), TorchLead(task), Response()
         self.welding = Welding(

@@ -13,13 +13,13 @@ import numpy as np
 
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.contact import LOST, Contact, Felt
+from flangeye_plugins.weld.following.contact import LOST, Contact, ContactMeasurement
 from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.probing import SOFTER, SWEEP_MARGIN, Probing
 from flangeye_plugins.weld.following.refined import RefinedPath
 from flangeye_plugins.weld.following.search import SweepSearch
 from flangeye_plugins.weld.following.task import WeldTask
-from flangeye_plugins.weld.following.tip import Advance, Pressing
+from flangeye_plugins.weld.following.tip import DeflectionTarget, SeamProgress
 from flangeye_plugins.weld.settings import INSIDE
 
 STEADY = 0.03e-3
@@ -39,7 +39,7 @@ class SeamReading:
     height: float
 
 
-class Located(NamedTuple):
+class TipPosition(NamedTuple):
     """Position of the tip at one measurement.
 
     Attributes:
@@ -70,7 +70,7 @@ class Sensing:
         latency: Running mean of the touches' latency [s].
     """
 
-    def __init__(self, task: WeldTask, progress: Advance, pressing: Pressing) -> None:
+    def __init__(self, task: WeldTask, progress: SeamProgress, pressing: DeflectionTarget) -> None:
         self._task, self._progress, self._pressing = task, progress, pressing
         prior = task.prior
         self.search = SweepSearch(task.settings, prior)
@@ -115,7 +115,7 @@ class Sensing:
         self.latency += 0.05 * (late - self.latency)
         return pose, Touch(touch.time, self._level @ touch.displacement)
 
-    def locate(self, pose: ToolPose, touch: Touch, phase: Phase) -> Located:
+    def locate(self, pose: ToolPose, touch: Touch, phase: Phase) -> TipPosition:
         """Return the tip's position relative to the plan, and its deformation, at a touch."""
         plan, prior = self._task.plan, self._task.prior
         corrected = self._corrected(touch.displacement, phase)
@@ -125,7 +125,7 @@ class Sensing:
         beside = float((tip[:2] - place.point) @ place.normal) - prior.beside
         felt = SeamReading(beside, float(tip[2]) - place.height)
         deflection = self._pressing.side * float((pose.position - tip)[:2] @ place.normal)
-        return Located(s, felt, deflection, float(corrected[2]), pose.angle)
+        return TipPosition(s, felt, deflection, float(corrected[2]), pose.angle)
 
     def _corrected(self, displacement: Floats, phase: Phase) -> Floats:
         """Return a displacement (3,) corrected for the finger's rest, gain and play [m]."""
@@ -138,13 +138,13 @@ class Sensing:
         gain = np.array([across, across, max(across, 1.0)])
         return np.asarray((moved - play) / gain)
 
-    def seek(self, touch: Touch, found: Located) -> None:
+    def seek(self, touch: Touch, found: TipPosition) -> None:
         """Process a touch during the search for the groove."""
         self.felt = found.seam
         compression = float(touch.displacement[2] - self.search.rest[2])
         self.search.feel(touch.displacement, found.deflection, compression)
 
-    def sweep(self, pose: ToolPose, touch: Touch, found: Located, noise: float) -> None:
+    def sweep(self, pose: ToolPose, touch: Touch, found: TipPosition, noise: float) -> None:
         """Process a touch during the sweep; ``noise`` is one touch's standard deviation [m]."""
         moved = turned(touch.displacement - self.search.rest, pose.angle)
         along = float(moved[:2] @ self._progress.place.tangent)
@@ -268,7 +268,7 @@ class SeamEstimate:
         return min(found.swept, SWEEP_MARGIN * self._task.settings.deflection)
 
     def begin(
-        self, found: SweepFit, height_noise: float, swept: list[Located], torch: float
+        self, found: SweepFit, height_noise: float, swept: list[TipPosition], torch: float
     ) -> None:
         """Start the path with the last touches of the sweep.
 
@@ -325,7 +325,7 @@ class SeamEstimate:
         """Mean height above the plan of the last accepted, seated touches [m]."""
         return float(np.mean(self._heights or [0.0]))
 
-    def weigh(self, time: float, found: Located, learned: SweepFit, side: float) -> None:
+    def weigh(self, time: float, found: TipPosition, learned: SweepFit, side: float) -> None:
         """Update the contact modes by a touch.
 
         Args:
@@ -340,7 +340,7 @@ class SeamEstimate:
         # Play is left out of the variance: it displaces the path's earlier touches by the same.
         spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
-        self.contact.take(Felt(*expected, found.deflection, found.compression), side)
+        self.contact.take(ContactMeasurement(*expected, found.deflection, found.compression), side)
         if self.contact.free <= LOST:
             self.lost = None
         elif self.lost is None:
@@ -375,7 +375,7 @@ class SeamEstimate:
             elif felt.s < end:
                 self.refined.add(*sample)
 
-    def regained(self, pressing: Pressing) -> bool:
+    def regained(self, pressing: DeflectionTarget) -> bool:
         """Return whether a wall holds the tip again.
 
         Probability alone is not enough, as a free tip moves with the arm and may coincide with the
@@ -383,7 +383,7 @@ class SeamEstimate:
         """
         return self.contact.free < 1.0 - LOST and self.contact.deflection > pressing.most / 2.0
 
-    def moved(self, found: Located) -> str:
+    def moved(self, found: TipPosition) -> str:
         """Return a message if the seam has moved since the weld that is resumed; else ""."""
         before = self._task.before
         enough = 15  # measurements that show whether it has moved

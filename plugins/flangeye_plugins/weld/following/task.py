@@ -32,7 +32,7 @@ class ResumePoint:
 
 
 @dataclass(frozen=True)
-class Onset:
+class WeldStart:
     """Start of a weld on its plan.
 
     Attributes:
@@ -64,12 +64,12 @@ class WeldTask:
     settings: Following
     touch: bool = True
     before: ResumePoint | None = None
-    given: Onset | None = None
+    given: WeldStart | None = None
 
     @property
-    def start(self) -> Onset:
+    def start(self) -> WeldStart:
         """Start of the weld: ``given``, or the default one."""
-        return Onset(self.settings.set_down) if self.given is None else self.given
+        return WeldStart(self.settings.set_down) if self.given is None else self.given
 
     @property
     def feels_ends(self) -> bool:

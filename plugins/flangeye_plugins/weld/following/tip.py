@@ -11,7 +11,7 @@ from flangeye_plugins.weld.following.probing import SOFTER
 from flangeye_plugins.weld.following.task import WeldTask
 
 
-class Advance:
+class SeamProgress:
     """Positions of tip and torch, as arc lengths of the plan.
 
     Attributes:
@@ -54,7 +54,7 @@ class Advance:
         self.coming, self.place = self.torch, self._plan.at(self.tip)
 
 
-class Pressing:
+class DeflectionTarget:
     """Set point of the tip's deflection against its wall.
 
     Attributes:

@@ -14,7 +14,7 @@ from flangeye_plugins.weld.following.model_prior import BAND
 from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
 from flangeye_plugins.weld.following.steering import ArcSequence, TorchLead
 from flangeye_plugins.weld.following.task import WeldTask
-from flangeye_plugins.weld.following.tip import Advance, Pressing
+from flangeye_plugins.weld.following.tip import DeflectionTarget, SeamProgress
 
 SHORT = 0.01
 """Largest share of the planned seam that a complete weld may leave out."""
@@ -35,8 +35,8 @@ class Welding:
     def __init__(
         self,
         task: WeldTask,
-        progress: Advance,
-        pressing: Pressing,
+        progress: SeamProgress,
+        pressing: DeflectionTarget,
         sensing: Sensing,
         seam: SeamEstimate,
         lead: TorchLead,

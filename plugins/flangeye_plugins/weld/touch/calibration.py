@@ -20,7 +20,7 @@ from flangeye_plugins.weld.touch.tag_observation import TagReading
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class HeldReading:
     """One reading of the tag with the tip held in the punch mark.
 
     Attributes:
@@ -34,7 +34,7 @@ class Held:
     force: Floats | None = None
 
 
-def calibrate(rest: Sequence[TagReading], held: Sequence[Held], source: str) -> Calibration:
+def calibrate(rest: Sequence[TagReading], held: Sequence[HeldReading], source: str) -> Calibration:
     """Return the finger's calibration, fitted to readings by least squares.
 
     Args:
@@ -93,7 +93,7 @@ def _mean_rotation(vectors: Sequence[Floats]) -> Floats:
     return rotation_log(nearest_rotation(matrices.mean(axis=0)))
 
 
-def _stiffness(held: Sequence[Held]) -> tuple[SI | None, SI | None]:
+def _stiffness(held: Sequence[HeldReading]) -> tuple[SI | None, SI | None]:
     """Return the stiffness across and along the finger [N/m]; None without measured forces."""
     known = [h for h in held if h.force is not None]
     if not known:

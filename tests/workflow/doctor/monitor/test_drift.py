@@ -300,7 +300,7 @@ def test_checks_are_taken_from_the_first_up_to_the_last() -> None:
     each = told(np.random.default_rng(6), 5)
     assert each.summed(1, 3).matrix == pytest.approx(each.matrix[1] + each.matrix[2])
     assert each.summed(3, None).vector == pytest.approx(each.vector[3] + each.vector[4])
-    looser = Information.of_covariance(allowance(1e-3), np.arange(6.0)).loosened(2e-3)
+    looser = Information.of_covariance(allowance(1e-3), np.arange(6.0)).after_unknown_motion(2e-3)
     assert looser.covariance == pytest.approx(5 * allowance(1e-3))
     assert looser.mean == pytest.approx(np.arange(6.0))
     assert allowance(1e-3) == pytest.approx(np.diag([4e-6] * 3 + [1e-6] * 3))

@@ -74,7 +74,7 @@ def _without_misfits(
 
 def _before(stored: StoredCalibration, history: History, test: DriftTest) -> Information:
     """Return the information in the calibration and the earlier checks."""
-    known = stored.prior.information.loosened(test.seasonal)
+    known = stored.prior.information.after_unknown_motion(test.seasonal)
     if not history.checks:
         return known
     told = information_of(stored.sightings(*history.sightings()), test.daily)
