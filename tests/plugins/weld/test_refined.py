@@ -51,12 +51,12 @@ def test_each_filter_is_the_dense_distribution_before_among_and_beyond_what_was_
     for s, offset in zip(places.tolist(), offsets.tolist(), strict=True):
         found.add(s, offset, 0.0)
     found.renew(-0.05, ALL)
-    means, variances = found._expected(np.array([at])), found._spread(np.array([at]))
+    means, variances = found._each(at)
     models = [(size, length) for size in SIZES for length in LENGTHS]
     for i, model in enumerate(models):
         mean, variance = dense(model, places, offsets, 30e-6, at)
-        assert means[i, 0] == pytest.approx(mean, abs=3e-6)
-        assert variances[i, 0] == pytest.approx(variance, rel=0.02, abs=1e-12)
+        assert means[i] == pytest.approx(mean, abs=3e-6)
+        assert variances[i] == pytest.approx(variance, rel=0.02, abs=1e-12)
 
 
 def test_a_field_s_transition_has_the_covariance_of_its_kind() -> None:

@@ -16,7 +16,6 @@ import math
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye.types import Floats
 from flangeye_plugins.weld.path import PATH_SPACING, Path
@@ -245,8 +244,8 @@ class RefinedPath:
         """Return the seam's offset from the plan at an arc length [m], and its variance [m^2]."""
         if self.empty:
             return 0.0, float(PRIOR[0] ** 2)
-        at = np.array([s])
-        means, variances, weights = self._expected(at)[:, 0], self._spread(at)[:, 0], self._weights
+        means, variances = self._each(s)
+        weights = self._weights
         middle = weights @ means
         spread = np.maximum(self._excess, 1.0) * variances + (means - middle) ** 2
         index, near = self._index(s), round(4e-3 / PATH_SPACING)
@@ -283,40 +282,40 @@ class RefinedPath:
         return place.point + here * place.normal, normal
 
     def offsets(self, s: Floats) -> Floats:
-        """Return the seam's offsets (K,) from the plan at arc lengths (K,) [m]."""
+        """Return the seam's offsets (K,) from the plan at arc lengths (K,) [m].
+
+        They are smoothed behind the tip and predicted ahead of it.
+        """
         if self.empty:
             return np.zeros(len(s))
-        return np.asarray(self._weights @ self._expected(s))
-
-    def _expected(self, s: Floats) -> Floats:
-        """Return each filter's offsets (M, K) [m]: smoothed behind the tip, predicted ahead."""
-        means, ahead = self._between(self._means, s)
+        means = self._between(self._means, s)
+        ahead = (s > self._passed).nonzero()[0]
         if len(ahead):
-            rows = self._ahead(s[ahead])
-            means[:, ahead] = np.einsum("kmi,mi->mk", rows, self._state)
-        return means
+            means[:, ahead] = np.einsum("kmi,mi->mk", self._ahead(s[ahead]), self._state)
+        return np.asarray(self._weights @ means)
 
-    def _spread(self, s: Floats) -> Floats:
-        """Return each filter's variances (M, K) at arc lengths (K,) [m^2]."""
-        variances, ahead = self._between(self._vars, s)
-        if len(ahead):
-            rows, field = self._ahead(s[ahead]), self._field.stationary
-            known = np.einsum("kmi,mij,kmj->mk", rows, self._covariance, rows)
-            over = rows[..., 3:]
-            lost = field[:, 0, 0, None] - np.einsum("kmi,mij,kmj->mk", over, field, over)
-            variances[:, ahead] = known + np.maximum(lost, 0.0)
-        return variances
+    def _each(self, s: float) -> tuple[Floats, Floats]:
+        """Return each filter's offset (M,) at an arc length [m], and its variance (M,) [m^2]."""
+        at = np.array([s])
+        if s <= self._passed:
+            return self._between(self._means, at)[:, 0], self._between(self._vars, at)[:, 0]
+        rows, field = self._ahead(at)[0], self._field.stationary
+        known = np.einsum("mi,mij,mj->m", rows, self._covariance, rows)
+        over = rows[:, 3:]
+        lost = field[:, 0, 0] - np.einsum("mi,mij,mj->m", over, field, over)
+        return np.einsum("mi,mi->m", rows, self._state), known + np.maximum(lost, 0.0)
 
-    def _between(self, kept: Floats, s: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """Return values kept per place (M, N), interpolated at ``s`` (M, K), and the indices ahead.
+    @property
+    def _passed(self) -> float:
+        """Arc length of the last place that the tip has passed [m]."""
+        return float(self._places[self._next - 1])
 
-        Those are the indices of the ``s`` that the tip has not passed.
-        """
+    def _between(self, kept: Floats, s: Floats) -> Floats:
+        """Return values kept per place (M, N), interpolated at arc lengths (K,)."""
         first = (s - self._start) / PATH_SPACING - 0.5
         below = np.minimum(np.maximum(first.astype(int), 0), max(self._next - 2, 0))
         share = np.minimum(np.maximum(first - below, 0.0), 1.0)
-        between = (1 - share) * kept[:, below] + share * kept[:, below + 1]
-        return between, (first > self._next - 1).nonzero()[0]
+        return np.asarray((1 - share) * kept[:, below] + share * kept[:, below + 1])
 
     def _ahead(self, s: Floats) -> Floats:
         """Return the rows (K, M, 6) by which the state predicts the offset ahead of the tip."""
