@@ -9,11 +9,15 @@ import hashlib
 import io
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import BaseModel, ValidationError, create_model
 
-from flangeye.workflow.log.records import LogFile, NotMcapError
+from flangeye.errors import StageError
+from flangeye.workflow.log.read import read_run
+from flangeye.workflow.log.records import LogFile, NotMcapError, reason_of
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
@@ -164,8 +168,8 @@ def test_a_damaged_chunk_is_named_by_its_number_and_the_next_is_read() -> None:
         assert damage == [f"record 2: {why}"]
     _, found, damage = read(header(), channel(), chunk(message(b"x"), crc=0), end())
     assert found == [b"x"] and damage == []  # without a checksum there is nothing to compare
-    _, found, damage = read(header(), channel(), chunk(message(b"x") + record(MESSAGE, b"")[:9]))
-    assert found == [b"x"] and len(damage) == 1  # an empty record ends where the chunk does
+    _, found, damage = read(header(), channel(), chunk(message(b"x") + record(200, b"")))
+    assert found == [b"x"] and damage == []  # an empty record, of a kind to come, ends the chunk
 
 
 @pytest.mark.parametrize(
@@ -227,3 +231,33 @@ def test_a_message_that_is_cut_inside_is_named_and_the_others_are_read() -> None
     assert found == [b"b"]
     assert len(damage) == 1 and damage[0].startswith("record 2: ")
     assert len(damage[0]) < 250
+
+
+def test_a_log_of_another_program_is_told_from_one_of_ours_that_just_begins(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(MAGIC + header("libmcap 1") + channel() + message(b"a") + end())
+    with pytest.raises(StageError, match="run.mcap: is an MCAP file, but not a log of flangeye$"):
+        read_run(path)
+    path.write_bytes(MAGIC + header("flangeye 1") + channel() + message(b"a"))
+    assert read_run(path).source is None
+    path.write_bytes(MAGIC + header("libmcap 1") + attachment("recipe.yaml", b"title: T") + end())
+    assert read_run(path).text("recipe.yaml") == "title: T"
+
+
+def test_what_is_wrong_is_one_short_line() -> None:
+    class Strict(BaseModel):
+        value: int
+
+    assert reason_of(ValueError("a" * 300)) == "a" * 200
+    assert reason_of(ValueError("\n  first \n second")) == "first"
+    assert reason_of(ValueError()) == "ValueError"
+    assert reason_of(KeyError("name")) == "it lacks 'name'"
+    assert reason_of(RecursionError()) == "it is nested too deeply"
+    assert reason_of(UnicodeDecodeError("utf-8", b"x", 0, 1, "why")) == "it is not UTF-8 text"
+    with pytest.raises(ValidationError) as error:
+        Strict.model_validate({"value": "x"})
+    assert reason_of(error.value).startswith("value: Input should be a valid integer")
+    fields: dict[str, Any] = {"n" * 300: (int, ...)}
+    with pytest.raises(ValidationError) as error:
+        create_model("Long", **fields).model_validate({})
+    assert len(reason_of(error.value)) == 200

@@ -17,7 +17,7 @@ from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder
-from flangeye.workflow.log.watch import follow, may_look, watch_run
+from flangeye.workflow.log.watch import follow, hidden_address, may_look, watch_run
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.runner import Runner
 from tests.conftest import TOY_RECIPE
@@ -233,6 +233,21 @@ def test_what_a_program_sends_reaches_no_terminal(caplog: pytest.LogCaptureFixtu
                     while True:
                         viewer.recv(timeout=0.5)
     assert not caplog.records
+
+
+def test_the_address_behind_the_gate_is_any_of_the_loopback_s(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+
+    def drawn(below: int) -> int:
+        asked.append(below)
+        return 0x010203
+
+    monkeypatch.setattr("secrets.randbelow", drawn)
+    host, port = hidden_address()
+    assert asked == [2**24] and port > 0
+    assert host in ("127.1.2.3", "127.0.0.1")  # the second where a system has no other
 
 
 def test_a_port_that_is_taken_is_one_line(log: Any) -> None:
