@@ -63,3 +63,24 @@ def test_viewers_see_the_scan_thinned_and_runs_have_all_of_it(tmp_path: Path) ->
     assert 10_000 < len(shown.data) / shown.point_stride <= 40_000
     (capture,) = read_run(tmp_path / "r.mcap").captures()
     assert capture.cloud.xyz.tobytes() == xyz.tobytes() and capture.cloud.xyz.shape == xyz.shape
+
+
+@pytest.mark.parametrize(
+    ("points", "shown"), [(100, 100), (40_000, 40_000), (40_001, 20_001), (79_999, 40_000)]
+)
+def test_viewers_see_a_small_cloud_whole_and_of_a_large_one_at_most_40000_points(
+    points: int, shown: int, tmp_path: Path
+) -> None:
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from mcap.reader import make_reader
+
+    xyz = np.random.default_rng(0).normal(0.0, 0.1, (points, 3)).astype(np.float32)
+    pose = t.by_frame(t.Transform(t.BASE, t.FLANGE, np.eye(4)))
+    recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "title: T"}, full_clouds=False)
+    recorder.flangeye_run_started(t.Source("hash"), 1)
+    recorder.flangeye_captured("0.acquire", t.Capture("a", t.PointCloud(t.CAMERA, xyz), pose), 0.1)
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "r.mcap").open("rb") as file:
+        ((_, _, message),) = make_reader(file).iter_messages(topics=["/capture/cloud"])
+    cloud = PointCloud.FromString(message.data)
+    assert len(cloud.data) // cloud.point_stride == shown

@@ -311,5 +311,5 @@ def _thinned(cloud: t.PointCloud, most: int = 40_000) -> NDArray[np.float32]:
         step = max(1, int(np.ceil(np.sqrt(len(flat) / most))))
         flat = cloud.xyz[::step, ::step].reshape(-1, 3)
     else:
-        flat = flat[:: max(1, len(flat) // most)]
+        flat = flat[:: max(1, -(-len(flat) // most))]
     return flat[np.isfinite(flat).all(axis=1)]
