@@ -263,14 +263,17 @@ def _colour_limit(fits: list[FittedFeature]) -> float:
 
 
 def fits_of(facts: Facts) -> list[FittedFeature]:
-    """Return every capture that has both a flange cloud and a circle with a normal."""
+    """Return every capture that has a flange cloud and a circle on its face.
+
+    The axis of a round body has no circle, and the body no face.
+    """
     log = facts.log
     flanges = {e.capture: e.value for e in log.of_kind("segment")}
     fits = []
     for entry in log.of_kind("fit"):
         flange, circle = flanges.get(entry.capture), entry.value
         if isinstance(flange, t.FlangeCloud) and isinstance(circle, t.CircleFeature):
-            if circle.normal is None or len(flange.cloud.xyz) == 0:
+            if circle.normal is None or not circle.radii or len(flange.cloud.xyz) == 0:
                 continue
             axes = basis_of_plane(circle.normal)
             fits.append(FittedFeature(str(entry.capture), flange.cloud, circle, axes))
