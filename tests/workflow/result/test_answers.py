@@ -177,3 +177,6 @@ def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told
     warnings = [w.text for w in sections.standing_warnings(found) if "held-out" in w.text]
     assert len(warnings) == (told is not None)
     assert all(told in text and "0.50 mm" in text for text in warnings)
+    fixes = [w.fix for w in sections.standing_warnings(found) if "held-out" in w.text]
+    trusted = {"more": "trust the held-out", "less": "trust the expected"}[told[:4]] if told else ""
+    assert all(fix.startswith(trusted) for fix in fixes)

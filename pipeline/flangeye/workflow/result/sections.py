@@ -85,25 +85,28 @@ def standing_warnings(result: Result) -> list[WarningResult]:
     if used < least_used * count and not (result.refused and used == 0):
         text = f"{count - used} of {count} captures were rejected"
         found.append((text, "look for the cause: flangeye doctor RUN"))
-    if unlike := _unlike(result):
-        found.append((unlike, "trust the held-out error; flangeye doctor RUN looks for the cause"))
+    found += _unlike(result)
     return [WarningResult(text=text, fix=fix) for text, fix in found]
 
 
-def _unlike(result: Result) -> str | None:
-    """Return a text if expected and held-out error differ significantly; else None.
+def _unlike(result: Result) -> list[tuple[str, str]]:
+    """Return a warning with its fix if expected and held-out error differ significantly.
 
     95 % of the errors should be below the expected bound. So the measured rms is not above that
     bound by chance, nor the measured 95 % quantile below the expected rms.
     """
     expected, held = result.expected_error, result.holdout
     if expected is None or held is None or (expected.rms <= held.p95 and held.rms <= expected.p95):
-        return None
-    more = "more" if held.rms > expected.p95 else "less"
-    return (
-        f"held-out error {held.rms * 1e3:.2f} mm rms, expected {expected.rms * 1e3:.2f} mm: "
-        f"{more} than chance explains"
+        return []
+    both = f"held-out error {held.rms * 1e3:.2f} mm rms, expected {expected.rms * 1e3:.2f} mm"
+    if held.rms > expected.p95:
+        fix = "trust the held-out error; flangeye doctor RUN looks for the cause"
+        return [(f"{both}: more than chance explains", fix)]
+    fix = (
+        "trust the expected error: held-out poses do not show what all poses share, such as the "
+        "camera's own calibration"
     )
+    return [(f"{both}: less than chance explains", fix)]
 
 
 def expected_error(result: Result) -> tuple[float, float] | None:
