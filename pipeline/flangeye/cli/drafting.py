@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from inspect import Parameter, Signature, signature
@@ -127,7 +126,8 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     draft = _drafted(survey, out, questions, registry)
     turned = {name: found for name, found in questions.likely.items() if name == "rotation"}
     if "acquire.images" in draft.text and given["camera"] is None and questions.prompt is None:
-        mounting = mounting_seen(_seen(draft, survey.folder, out, registry, 12) or ())
+        shown = _seen(draft, survey.folder, out, registry, 12, needed=True)
+        mounting = mounting_seen(shown or ())
         if mounting is None:
             return draft
         questions.given, questions.likely = given, {**turned, "camera": mounting}
@@ -135,9 +135,10 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
         return draft_recipe(survey, out, questions, registry)
     if "fit.rim" not in draft.text or _seen(draft, survey.folder, out, registry, 1) != []:
         return draft
-    if _seen(draft, survey.folder, out, registry, 1, ["steps.0.unit=cm"]):
+    in_cm = replace(draft, text=draft.text.replace("archive: {", "archive: {unit: cm, ", 1))
+    if _seen(in_cm, survey.folder, out, registry, 1):
         questions.assumed.append("clouds in cm: read in m or mm, no scan shows the flange")
-        return replace(draft, text=draft.text.replace("archive: {", "archive: {unit: cm, ", 1))
+        return in_cm
     questions.given["target"] = None
     seen = "what is seen instead, 'body: gripper.stl' for a tool by its mesh"
     questions.ask("target", f"no scan shows the flange; {seen}", "flange")
@@ -172,26 +173,25 @@ def _drafted(survey: FolderSurvey, out: Path, questions: Questions, registry: Re
 
 
 def _seen(
-    draft: Draft,
-    folder: Path,
-    out: Path,
-    registry: Registry,
-    count: int,
-    overrides: Sequence[str] = (),
+    draft: Draft, folder: Path, out: Path, registry: Registry, count: int, needed: bool = False
 ) -> list[Observation] | None:
-    """Return the first scans that show a drafted recipe's target; None if it does not run."""
+    """Return the first scans that show a drafted recipe's target; None if it does not run.
+
+    Raises:
+        RecipeError: None shows it, and one is ``needed``.
+    """
     from flangeye.types import ArchivePath
     from flangeye.workflow.recipe.load import parse_recipe
     from flangeye.workflow.run.runner import Runner
 
     try:
         # Its paths start at the recipe's folder.
-        recipe = parse_recipe(
-            draft.text, out.name, registry, [f"steps.0.path={folder}", *overrides]
-        )
+        recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
         with at_work("looking for the target"):
             return Runner(recipe, registry, ArchivePath(folder)).take(count)
-    except NothingSeen:
+    except NothingSeen as error:
+        if needed:
+            raise RecipeError(str(error).replace("write fit.", "say --target ")) from None
         return []
     except FlangeyeError:
         return None

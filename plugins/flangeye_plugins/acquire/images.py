@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from flangeye import Params, StageError, stage
+from flangeye.errors import NothingSeen
 from flangeye.files.cameras import CameraFile, camera_in, cameras_in
 from flangeye.files.clouds import LengthUnit
 from flangeye.files.depth import read_scan
@@ -173,7 +174,7 @@ def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rej
     """Return the corners of the board in each image, or the reason why there are none.
 
     Raises:
-        StageError: None of a first sample, spread over all images, shows the board.
+        NothingSeen: None of a first sample, spread over all images, shows the board.
     """
     views = {name: Image(pixels, np.eye(3)) for name, pixels in images.items()}
     if len(views) <= FIRST:
@@ -194,7 +195,7 @@ def _spread_over(names: Sequence[str]) -> list[str]:
 
 def _not_shown(
     board: Board, missed: Mapping[str, Rejected], count: int, first: Image
-) -> StageError:
+) -> NothingSeen:
     """Return the error that no image shows the board; it names a board seen in the first one."""
     name, found = next(iter(missed.items()))
     seen = board_seen(first.pixels)
@@ -205,7 +206,7 @@ def _not_shown(
     if marked and isinstance(find_corners(board, mirrored), Corners):
         instead = "it shows the board mirrored: switch off image flipping in the driver"
     what = board.kind if board.kind == "marker" else f"{board.kind}, {board.columns} x {board.rows}"
-    return StageError(
+    return NothingSeen(
         f"none of {len(missed)} of the {count} images, spread over all, shows the board ({what}); "
         f"{name}: {instead}"
     )
@@ -217,7 +218,7 @@ def _require_shown(
     """Refuse images if none of a sample shows the board, before searching all of them.
 
     Raises:
-        StageError: None of the sample shows it; the message names a board that is seen.
+        NothingSeen: None of the sample shows it; the message names a board that is seen.
     """
     files = {r.id: r.image for r in usable if r.image is not None}
     first = _spread_over(list(files))
@@ -410,7 +411,7 @@ def _cameras(
     try:
         lens = lens_of(images, params.board.board, start)
     except StageError as error:
-        raise StageError(f"{root}: {error}") from None
+        raise type(error)(f"{root}: {error}") from None
     told: list[str] = [filed.note()] if filed else []
     told += [odd] if known and (odd := lens.against(known[0])) else []
     camera = lens.matrix, lens.distortion, lens.covariance
