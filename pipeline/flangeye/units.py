@@ -28,7 +28,7 @@ _UNITS: dict[str, tuple[str, dict[str, Decimal]]] = {
     "force": ("3 N", {"N": Decimal(1), "mN": _MILLI}),
     "stiffness": ("2 N/mm", {"N/mm": Decimal("1e3"), "N/m": Decimal(1)}),
 }
-"""By kind: an example, and each unit in SI units."""
+"""An example of each kind of quantity, and each of its units in SI units."""
 
 
 def parse_quantity(value: object, kind: str) -> float:

@@ -476,7 +476,7 @@ def _principles(label: str) -> ui.select:
 
 
 Boxes = Mapping[str, tuple[str, Callable[[str], Any]]]
-"""By option of a command: what its box is called, and what it is."""
+"""Label and input element of each option of a command."""
 IMPORTED: Mapping[str, Boxes] = {
     "robot": {
         "urdf": ("Its URDF file, in this folder", ui.input),

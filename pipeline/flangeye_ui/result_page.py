@@ -128,7 +128,7 @@ LIGHTS = {
     "incomplete": ("fair", "…", "Not finished"),
     "refused": ("poor", "✕", "Do not use"),
 }
-"""By verdict: tone, sign and words of the light."""
+"""Tone, sign and words of the status light for each verdict."""
 Show = Callable[[Project, Path, Facts, ActionBar], None]
 
 

@@ -55,7 +55,7 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "x-frame-options": "DENY",
 }
-"""Of every answer that has none of its own."""
+"""Headers of every answer that sets none of its own."""
 
 
 def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool) -> None:

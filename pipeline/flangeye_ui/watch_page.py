@@ -29,7 +29,7 @@ STATES = {
     "DEGRADED": ("fair", "calibrate again soon"),
     "MOVED": ("poor", "calibrate again before you use it"),
 }
-"""By state of a check: tone, and what it means to whoever uses the calibration."""
+"""Tone of each state of a check, and its meaning for the user of the calibration."""
 
 
 def add(project: Project) -> None:

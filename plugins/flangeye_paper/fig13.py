@@ -103,7 +103,7 @@ def seen(session: SessionRow) -> SeenWeld:
 
 
 Welds = Mapping[str, Sequence[SeenWeld]]
-"""By how the seam was followed."""
+"""Welds by the method that followed the seam."""
 
 
 def fig13(batches: Path, out: Path) -> None:

@@ -52,7 +52,7 @@ RECORDINGS: Mapping[str, CentreSet] = {
     "ur5": CentreSet("UR5, 52 published centres", "ur5"),
     "franka": CentreSet("Franka, 48 published centres", "franka"),
 }
-"""By the name of the archive's last folder or file."""
+"""Published centres by the name of the archive's last folder or file."""
 
 
 def heldout(batches: Path, archive: Path, out: Path) -> None:

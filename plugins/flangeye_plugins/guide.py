@@ -46,7 +46,7 @@ ATTITUDES = (
     "turned by 40 deg about its axis, and leaning forwards",
     "turned by 40 deg the other way, and leaning to the left",
 )
-"""How the tool stands each time: a cone about the mark."""
+"""Orientations of the tool: a cone about the mark."""
 
 
 @part("guide.tactile")

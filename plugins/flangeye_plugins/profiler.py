@@ -45,9 +45,9 @@ class TcpParams(Params):
     column: int = Field(1, ge=1)
     """Which column of a line is the bead's offset."""
     separator: str = Field(",", min_length=1, max_length=1)
-    """Between two columns."""
+    """Separator between two columns."""
     unit: Literal["m", "mm", "um"] = "mm"
-    """Of that column."""
+    """Unit of that column."""
     positive: Literal["left", "right"] = "left"
     """To which side of the joint, along the weld, it is positive."""
     latency: Duration = param("10 ms", ge=0)

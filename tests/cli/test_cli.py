@@ -185,7 +185,7 @@ def test_what_was_measured_before_is_shown_as_that(tmp_path: Path) -> None:
     run, recipe = str(tmp_path / "run"), str(tmp_path / "points.yaml")
     CliRunner().invoke(commands(), ["run", recipe, "--out", run], catch_exceptions=False)
     shown = CliRunner().invoke(commands(), ["show", run], catch_exceptions=False).output
-    assert shown.splitlines()[1] == "5 of 5 measurements went through"
+    assert "5 of 5 measurements went through" in shown.splitlines()
 
 
 def test_a_folder_is_kept_once_something_was_gathered(

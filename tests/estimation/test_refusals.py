@@ -185,7 +185,7 @@ def test_noise_that_is_not_stated_is_found() -> None:
     made = session(MARKER, rng, n=60, noise=Noise(arm_shift=5e-4))
     (note,) = solved(made).notes
     beyond = float(
-        note.removeprefix("estimated noise of a pose beyond its feature's: ").split(" mm")[0]
+        note.removeprefix("estimated noise of each pose in addition to its fit's: ").split(" mm")[0]
     )
     assert 0.4 < beyond < 0.65
 

@@ -181,12 +181,13 @@ def _mm(metres: float) -> str:
 
 
 def print_log(console: Console, log: RunLog) -> None:
-    """Print what happened in a run, step by step."""
+    """Print a run's result, then what happened in it, step by step."""
     from rich.table import Table
     from rich.text import Text
 
-    result = logged_result(log)
-
+    if result := logged_result(log):
+        print_details(console, result)
+        write(console, "")
     state = _state(log)
     expected = f" of {log.total}" if log.total else ""
     write(console, _hung(console, f"{log.path}: {state}"))
@@ -216,8 +217,6 @@ def print_log(console: Console, log: RunLog) -> None:
         last = [e for e in log.entries if e.capture == log.finished[-1]]
         after = f", last step {last[-1].step}" if last else ""
         write(console, f"last finished capture: {log.finished[-1]}{after}")
-    if result:
-        print_details(console, result)
 
 
 def _state(log: RunLog) -> str:

@@ -392,7 +392,7 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
     found, cell = session.found, session.cell
     turn, shift = _noise_beyond(found)
     notes: list[Note] = [
-        f"estimated noise of a pose beyond its feature's: {shift * 1e3:.3f} mm and "
+        f"estimated noise of each pose in addition to its fit's: {shift * 1e3:.3f} mm and "
         f"{np.degrees(turn):.3f} deg per axis"
     ]
     if len(found.problem.ends) > 1:

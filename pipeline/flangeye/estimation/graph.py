@@ -146,6 +146,7 @@ class Problem:
             )
             for c in self.carriers
         ]
+        # Times are indices of poses, which are now counted anew
         seen = replace(seen, times=np.searchsorted(times, seen.times))
         return replace(self, frames=frames, carriers=carriers, seen=seen)
 
@@ -156,6 +157,7 @@ class Problem:
     def without_normals(self, which: Mask) -> Problem:
         """Return the problem with some circles reduced to their centres."""
         projectors = self.seen.projectors.copy()
+        # The rank of each sighting is read from its projector's trace
         projectors[which, :3, :3] = 0.0
         return replace(self, seen=replace(self.seen, projectors=projectors))
 
@@ -179,6 +181,7 @@ class Problem:
         out = {}
         for name, (turn, shift) in zip(self.unknown, step.reshape(-1, 2, 3), strict=True):
             place = np.array(places[name])
+            # On the left: the move is in the parent's axes, about the frame's own origin
             place[:3, :3] = rotation_exp(turn) @ place[:3, :3]
             place[:3, 3] += shift
             out[name] = place

@@ -117,6 +117,7 @@ def spread_of(points: Floats) -> Spread:
     """Measure (N, 3) points."""
     centred = points - points.mean(axis=0)
     axis = np.linalg.svd(centred, full_matrices=False)[2][0]
+    # A singular vector's sign is arbitrary; messages must not change with it
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
     along = centred @ axis
     off = np.linalg.norm(centred - np.outer(along, axis), axis=1)
@@ -164,6 +165,7 @@ def require_same_units(centres: Floats, tcps: Floats) -> None:
     Raises:
         CalibrationRefused: The ratio of the two medians is not between 0.5 and 2.
     """
+    # A rigid motion keeps distances; mm taken for m would give a ratio of 1000
     ratio = _median_distance(centres) / _median_distance(tcps)
     if not 0.5 < ratio < 2.0:
         raise CalibrationRefused(
@@ -180,6 +182,7 @@ def require_right_handed(centres: Floats, tcps: Floats) -> None:
     """
     straight = _fit_rms(centres, tcps)
     mirrored = _fit_rms(centres * [1.0, 1.0, -1.0], tcps)
+    # Centres near one plane fit their mirror image as well: a good direct fit is never refused
     if straight > 1e-3 and mirrored < 0.1 * straight:
         raise CalibrationRefused(
             f"the centres fit the poses only when mirrored ({mirrored * 1e3:.1f} mm rms instead "
@@ -284,6 +287,7 @@ def fewest(problem: Problem) -> int:
     """Return the fewest sightings of one camera and one target that determine the unknowns."""
     ranks, count = problem.seen.ranks, len(problem.unknown)
     if (ranks == 6).all():
+        # A X = X B needs two motions about different axes (Tsai & Lenz 1989): three poses
         return {1: 3, 2: 3}.get(count, 6)
     if count == 1:
         return 3
@@ -343,6 +347,7 @@ def unobservable(
     moves = scale[:, None] * (basis @ weak.moves)
     directions = np.asarray(np.linalg.qr(moves)[0])
     turns = directions.reshape(len(problem.unknown), 2, 3, -1)[:, 0]
+    # A rotation that is unknown moves the work by its lever: only pure translations are marked
     if mark and np.abs(turns).max() < 0.05:
         return directions
     if _is_configuration(problem):
@@ -359,6 +364,7 @@ def _meaningful(problem: Problem, places: Places) -> Floats:
     nothing = _turned(problem, places, meaningless(problem))
     if not nothing.shape[1]:
         return np.eye(len(nothing))
+    # Left singular vectors beyond the rank span the orthogonal complement
     return np.asarray(np.linalg.svd(nothing, full_matrices=True)[0][:, nothing.shape[1] :])
 
 

@@ -86,6 +86,7 @@ def rough(
     """
     places, squares = begin(problem, search)
     agree, effects = agreeing(problem, squares), effects_of(problem, None, ModelOptions())
+    # Two Gauss-Newton steps: the second leaves out what the first finds to be an outlier
     for _ in range(2):
         model = model_at(problem, places, effects, agree.astype(float))
         found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])))
@@ -159,6 +160,7 @@ def most_informative(
         worth[chosen] = -np.inf
         best = int(np.argmax(worth))
         chosen.append(best)
+        # Kalman's update: it needs the candidate's design, not its measured value
         covariance = covariance - gain[best] @ inner[best] @ gain[best].T
     return np.array(chosen, dtype=np.intp), covariance
 
@@ -212,6 +214,7 @@ def _moved(like: Feature, pose: Floats) -> Feature:
     if like.normal is None or like.normal_covariance is None:
         return replace(like, centre=pose[:3, 3])
     axis, size = pose[:3, 2], np.trace(like.normal_covariance) / 2
+    # A unit normal has no error along itself, so both halves of its variance are across it
     across = size * (np.eye(3) - np.outer(axis, axis))
     return replace(like, centre=pose[:3, 3], normal=axis, normal_covariance=across)
 
@@ -223,6 +226,7 @@ def whitened(
     problem = problem_of(sightings, cell)
     model = model_at(problem, found.places, found.effects, np.ones(len(sightings)))
     values, vectors = np.linalg.eigh(model.weights(found.fit.sizes))
+    # Symmetric roots of the weights; a centre's are singular, so Cholesky would fail
     roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     return roots @ model.design, (roots @ model.residuals[..., None])[..., 0]
 
@@ -232,7 +236,10 @@ def _levers(found: Preview, cell: Cell, seen: Sequence[Observation]) -> Floats:
     blocks, work = [], work_of_frames(found, cell, seen)
     for i, (name, points) in enumerate(work.items()):
         block = np.zeros((len(points), 3, len(found.fit.mean)))
+        # A turn w about the frame's origin o moves a point p by w x (p - o), a shift moves all
+        # alike
         block[:, :, 6 * i : 6 * i + 3] = -hat(points - found.places[name][:3, 3])
         block[:, :, 6 * i + 3 : 6 * i + 6] = np.eye(3)
+        # The mean over a frame's points: a camera with many sightings counts no more than others
         blocks.append(stack_rows(block) / np.sqrt(len(points)))
     return np.concatenate(blocks)

@@ -48,18 +48,19 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     """
     n = len(problem.seen)
     chosen = np.unique(np.linspace(0, n - 1, min(n, COUNT)).round().astype(int))
-    session = _foreseen(problem.where(chosen), places)
+    session = _simulated(problem.where(chosen), places)
     carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
+    # A new pose is reached through the joints of one arm's flange; all else keeps its poses
     if carrier is None or carrier.link is not None or not joints_known(carrier):
         return _all_of(session)
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
-        return _all_of(_foreseen(_in_box(problem, carrier, sides), places))
+        return _all_of(_simulated(_in_box(problem, carrier, sides), places))
     at = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times, :3, 3]
     inner = np.array([at.min(axis=0), at.max(axis=0)])
     outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
     widest = 2.5  # spacings of poses that a box reaches beyond these
-    wide = _foreseen(_in_box(problem, carrier, inner + widest * outward), places)
+    wide = _simulated(_in_box(problem, carrier, inner + widest * outward), places)
     # Eight boxes that the poses may have been drawn from, equally likely: from the outermost of n
     # evenly drawn poses to the box's side the distance is exponential, with the spacing as mean
     beyond = np.random.default_rng(0).exponential(size=(8, 2, 3)).clip(max=widest)
@@ -70,7 +71,7 @@ def _all_of(work: Problem) -> Work:
     return Work(work, work, np.ones((1, len(work.seen)), dtype=bool))
 
 
-def _foreseen(work: Problem, places: Places) -> Problem:
+def _simulated(work: Problem, places: Places) -> Problem:
     return replace(work, seen=_predicted(work, places))
 
 
@@ -78,6 +79,7 @@ def _inside(work: Problem, box: Floats) -> Mask:
     """Return the mask (W,) of sightings with the flange in a box (2, 3); all if none have."""
     places = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times, :3, 3]
     inside = np.asarray(((places >= box[0]) & (places <= box[1])).all(axis=1))
+    # A box without any reachable pose must still give an average
     return inside if inside.any() else ~inside
 
 
@@ -87,12 +89,14 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
     The sightings are unchanged if the arm reaches no pose in the box.
     """
     evenly = spread_evenly(COUNT, 4)
+    # The fourth coordinate of the sequence chooses whose orientation a pose takes
     like = (evenly[:, 3] * len(problem.seen)).astype(int)
     session = np.asarray(problem.frames[carrier.frame].place)
     poses = session[problem.seen.times[like]].copy()
     poses[:, :3, 3] = box[0] + (box[1] - box[0]) * evenly[:, :3]
     apart = np.linalg.norm(poses[:, None, :3, 3] - session[:, :3, 3], axis=2)
     arm, joints = known(carrier)
+    # Started at the nearest recorded posture, the arm keeps its branch (elbow up or down)
     joints, reached = reached_from(arm, poses, joints[apart.argmin(axis=1)])
     if not reached.any():
         return problem
@@ -126,6 +130,7 @@ def _predicted(problem: Problem, places: Places) -> Sightings:
     normals, projectors = rotations[:, :, 2], s.projectors.copy()
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     projectors[ranks == 5, :3, :3] = across[ranks == 5]
+    # A fit's noise belongs to the target: it rotates with it in the camera's frame
     turn = rotations @ np.swapaxes(s.rotations, 1, 2)
     turn[ranks < 5] = np.eye(3)
     both = np.zeros((count, 6, 6))

@@ -29,7 +29,7 @@ class Recess(Model):
     radius: Length = param(gt=0)
     """Radius of the circle its centre line follows."""
     half_span: Angle
-    """Half the angle its centre line covers, ends aside."""
+    """Half of the angle that the slot's centre line spans, without its rounded ends."""
     width: Length = param(gt=0)
     depth: Length = param(gt=0)
 
@@ -145,7 +145,7 @@ class RobotModel(Model):
     """Reason why there are no volumes, shown to a plan that needs them."""
     repeatability: Length = param("0.1 mm")
     joint_speed: AngularSpeed = param("180 deg/s", gt=0)
-    """Of the slowest joint, as the maker has it: no recipe may ask for more."""
+    """Speed limit of the slowest joint by the maker; no recipe may ask for more."""
     joint_accuracy: Angle = param("0.3 mrad")
     """Standard deviation of a joint's zero; makers do not publish it, so it is assumed."""
     source: str

@@ -53,7 +53,7 @@ class SeamLine(Model):
     half_angle: Angle | None = None
     """Between a wall and the opening."""
     half_width: Length | None = None
-    """From the root to a shoulder, sideways."""
+    """Lateral distance from the root to a shoulder."""
 
 
 class WorkpieceFile(Model):
@@ -112,7 +112,7 @@ class Workpiece:
 
     @property
     def diagonal(self) -> float:
-        """Of the box around it [m]."""
+        """Diagonal of the bounding box [m]."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
 

@@ -22,7 +22,7 @@ from flangeye.types import Floats, Transform
 
 
 class Executor:
-    """An open arm under watch.
+    """Moves an open arm while a guard supervises it.
 
     A real arm is owned and watched by a guard in a process of its own (:func:`led`), which stops it
     if this process hangs or dies. The same checks run in this process, in the control loop; in
@@ -30,7 +30,7 @@ class Executor:
 
     Attributes:
         robot: The arm.
-        told: Called with each state of the arm.
+        told: Function that is called with each state of the arm.
         limits: The arm's motion limits.
     """
 

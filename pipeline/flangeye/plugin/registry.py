@@ -130,7 +130,7 @@ class Registry:
         return self.parts[name]
 
     def graph(self, name: str = "ros2") -> Graph:
-        """Return a network of nodes, joined.
+        """Join a network of nodes, such as ROS 2, and return it.
 
         Raises:
             FlangeyeError: No plugin offers a network of this name.

@@ -58,7 +58,7 @@ from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye.workflow.doctor.diagnosis import Finding, NotApplicable, RecordedSession
 
 AT = np.array([0.05, -0.03, 0.7])
-"""Where the work is, in ``camera`` [m]."""
+"""Position of the work in ``camera`` [m]."""
 
 REMARKS = ("flangeye: a pose of the kit", "REFUSED, DO NOT USE: the kit says so")
 
@@ -98,7 +98,7 @@ class CheckConformance(Conformance):
         require(first == again, "two calls with equal input differ")
 
     def test_it_finds_nothing_where_nothing_is_wrong(self) -> None:
-        """A known cell with 0.05 mm of noise; a note is not a mistake."""
+        """A known cell with 0.05 mm of noise gives no finding above a note."""
         mistakes = [finding.what for finding in self.found(session()) if not finding.note]
         require(not mistakes, f"found in good recordings: {'; '.join(mistakes)}")
 

@@ -39,10 +39,10 @@ from flangeye.testing.base import (
 from flangeye.testing.sources import logged
 
 SPEED = 0.3
-"""Of joints in the kit's moves [rad/s]: slow enough for a real arm."""
+"""Joint speed of the kit's moves [rad/s], slow enough for a real arm."""
 
 ACCELERATION = 2.0
-"""Of joints in the kit's moves [rad/s^2]."""
+"""Joint acceleration of the kit's moves [rad/s^2]."""
 
 TESTED_TURN = 0.1
 """How far the last joint is turned [rad]."""
@@ -51,7 +51,7 @@ RESTS = 0.5
 """Longest time from the last look at a moving arm until it rests [s]."""
 
 LATE = 1.0
-"""What a busy machine may add to any time that is measured [s]."""
+"""Delay that a busy machine may add to a measured time [s]."""
 
 
 class DriverConformance(Conformance):
@@ -77,7 +77,7 @@ class DriverConformance(Conformance):
             yield device
 
     def test_closing_twice_is_safe_and_it_opens_again(self) -> None:
-        """A run that broke off is resumed: the device must be free immediately."""
+        """The device can be closed twice, and opened again at once, as on a resume."""
         for _ in range(3):
             device = self.open()
             require(device.name, "the device has no name")
@@ -132,7 +132,7 @@ class RobotConformance(DriverConformance):
             require(robot.state().time_ns > first, "20 cycles later the sample is as old as before")
 
     def test_a_joint_move_arrives_and_keeps_to_its_speed(self) -> None:
-        """There and back, never faster than the commanded limit."""
+        """The joint moves there and back, never faster than the commanded limit."""
         with self.opened() as robot:
             start = robot.state().joints
             target = start + np.eye(len(start))[-1] * TESTED_TURN
@@ -147,7 +147,7 @@ class RobotConformance(DriverConformance):
                 )
 
     def test_it_stops_at_once(self) -> None:
-        """Stopped in the middle of a move, it stays at rest."""
+        """An arm stopped in the middle of a move stays at rest."""
         with self.opened() as robot:
             start = robot.state().joints
             self._under_way(robot, start)
@@ -248,7 +248,7 @@ class ScannerConformance(DriverConformance):
         raise AssertionError("five exposures in a row were dropped")
 
     def test_it_gives_points_in_metres(self) -> None:
-        """In ``camera``, single precision, missing points NaN, within the scanner's range."""
+        """Points are in ``camera`` [m], within range, single precision, NaN if missing."""
         with self.opened() as scanner:
             require(isinstance(scanner, Scanner), "it lacks methods of flangeye.devices.Scanner")
             cloud = self.scanned(scanner).cloud
@@ -290,7 +290,7 @@ class ScannerConformance(DriverConformance):
         require(later, "the second scan began or ended before the first")
 
     def test_a_scan_survives_the_log(self) -> None:
-        """As a capture, written to MCAP and read back."""
+        """A capture with the scan is unchanged after it is written to MCAP and read back."""
         with self.opened() as scanner:
             scan = self.scanned(scanner)
         pose = t.Transform(t.BASE, t.FLANGE, np.eye(4))
@@ -299,13 +299,13 @@ class ScannerConformance(DriverConformance):
 
 
 class StreamConformance(DriverConformance):
-    """Base of the two whose device gives one thing after another by itself."""
+    """Base of the conformance classes of devices that deliver items by themselves."""
 
     # Its method that gives the next, and what that is called
     gives: ClassVar[str]
 
     def given(self, device: Any, count: int) -> list[Any]:
-        """Return the next things; there is none for as long as no new one has come."""
+        """Return the next items; a call without a new item returns none."""
         found: list[Any] = []
         limit = time.monotonic() + PATIENCE + LATE
         while len(found) < count and time.monotonic() < limit:
@@ -346,7 +346,7 @@ class SensorConformance(StreamConformance):
         return {StateSource: _Standing(), Finger: finger}
 
     def test_its_camera_is_calibrated(self) -> None:
-        """A pinhole matrix [px] for the images it delivers."""
+        """The sensor has a pinhole matrix [px] for its images."""
         with self.opened() as sensor:
             require(isinstance(sensor, TactileSensor), "it lacks methods of devices.TactileSensor")
             image = self.given(sensor, 1)[0].image

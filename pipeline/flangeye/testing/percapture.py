@@ -42,7 +42,7 @@ from flangeye.types import (
 from flangeye.types.geometry import rigid, rotation_exp
 
 DEPTH = 0.7
-"""Of the flange's centre in ``camera`` [m]."""
+"""Position of the flange's centre in ``camera`` [m]."""
 
 WALL = 1.1
 """Depth of the wall behind it [m]."""
@@ -54,7 +54,7 @@ FACING = rigid(rotation_exp(np.array([np.pi - 0.25, 0.15, 0.3])), np.array([0.01
 
 @dataclass(frozen=True)
 class Change:
-    """Something done to a whole scene: x' = scale * matrix @ x + shift.
+    """A similarity transform of a whole scene: x' = scale * matrix @ x + shift.
 
     Attributes:
         matrix: (3, 3) rotation or reflection.
@@ -225,15 +225,15 @@ class PerCaptureConformance(Conformance):
         require_repeats(lambda: self.answer()[0])
 
     def test_it_is_right_in_metres_and_in_the_cameras_frame(self) -> None:
-        """The centre of a scan without noise."""
+        """The centre found in a scan without noise is within tolerance."""
         self._require_centre(SAME, "a plain scan")
 
     def test_it_moves_with_the_scene(self) -> None:
-        """Turned and shifted, so is the answer."""
+        """If the scene is rotated and shifted, the answer moves with it."""
         self._require_centre(MOVED, "a scan that was moved")
 
     def test_it_scales_with_the_scene(self) -> None:
-        """A flange a quarter larger, and farther away."""
+        """A flange a quarter larger and farther away gives a centre scaled likewise."""
         self._require_centre(Change(scale=1.25), "a scan that was scaled")
 
     def test_it_follows_a_mirror(self) -> None:
@@ -242,7 +242,7 @@ class PerCaptureConformance(Conformance):
         self._require_centre(mirror, "a scan that was mirrored")
 
     def test_its_answer_survives_the_log(self) -> None:
-        """Written to MCAP and read back, it is the same."""
+        """The answer is unchanged after it is written to MCAP and read back."""
         require_round_trip(self.answer()[0])
 
 
@@ -271,7 +271,7 @@ class SegmentConformance(PerCaptureConformance):
         require(far < 3 * scene.radius, f"the cloud reaches {far:.3f} m from the centre")
 
     def test_nothing_to_see_is_refused(self) -> None:
-        """No points at all, and a bare wall."""
+        """A scan without points and a bare wall are refused."""
         scene = self.scene()
         for what, xyz in (
             ("a scan of nothing", np.full_like(scene.xyz, np.nan)),
@@ -292,7 +292,7 @@ class FitConformance(PerCaptureConformance):
         return {FlangeCloud: scene.flange_cloud(), Capture: scene.capture()}
 
     def test_its_covariances_are_covariances(self) -> None:
-        """Symmetric, no negative variance, and not zero."""
+        """Covariances are symmetric, not zero, and have no negative variance."""
         value, _ = self.answer()
         require(
             isinstance(value, (CircleFeature, PoseFeature)),
@@ -314,7 +314,7 @@ class FitConformance(PerCaptureConformance):
                 )
 
     def test_too_little_is_refused(self) -> None:
-        """Two points, points on a line, one point many times: no circle."""
+        """Two points, points on a line and one repeated point are refused."""
         scene = self.scene()
         line = scene.centre + np.linspace(-1, 1, 200)[:, None] * [scene.radius, 0.0, 0.0]
         for what, points in (

@@ -31,7 +31,7 @@ WORK = np.array([0.55, -0.05, 0.45])
 """Middle of the work, in ``base`` [m]."""
 
 SIZE = np.array([0.3, 0.3, 0.2])
-"""Of the work [m]."""
+"""Extent of the work along each axis [m]."""
 
 NOISE = 0.05e-3
 """Standard deviation of a centre [m]."""
@@ -94,7 +94,7 @@ def elsewhere(observations: Sequence[t.Observation], motion: Floats) -> list[t.O
 
 
 class SolvingConformance(Conformance):
-    """Base of the three."""
+    """Base of the conformance classes of solve, refine and verify stages."""
 
     gives: ClassVar[type] = t.HandEye
 
@@ -227,7 +227,7 @@ class RefineConformance(SolvingConformance):
     tolerance: ClassVar[float] = 0.2e-3
 
     def test_it_leaves_a_good_calibration_good(self) -> None:
-        """A known cell with 0.05 mm of noise, solved already."""
+        """Refining the solution of a known cell with 0.05 mm of noise keeps it within tolerance."""
         answer = self.answer(observed(work_points()))
         self._require_pose(answer, CAMERA, self.tolerance, "a good calibration")
         require_covariance(answer.camera.covariance, "the pose's covariance")

@@ -82,7 +82,7 @@ class AcquireConformance(Conformance):
         )
 
     def test_poses_and_points_are_in_metres_and_frames(self) -> None:
-        """Poses within an arm's reach, points within the scanner's."""
+        """Poses are within the arm's reach and points within the scanner's range, in metres."""
         for item in self.acquired()[1]:
             pose = item.base_T_flange
             require((pose.parent, pose.child) == (t.BASE, t.FLANGE), f"a pose is {pose.name}")
@@ -102,7 +102,7 @@ class AcquireConformance(Conformance):
             require_round_trip(capture, logged)
 
     def test_a_missing_archive_is_refused(self) -> None:
-        """Without the recordings it needs, it is refused in one line."""
+        """A stage without the recordings that it needs is refused in one line."""
         if t.ArchivePath in self.plugin.needs.values():
             for path in (None, Path("no/such/recordings")):
                 given = {t.ArchivePath: t.ArchivePath(path)}
@@ -144,7 +144,7 @@ class ReaderConformance(Conformance):
         require(first == again, "two readings differ")
 
     def test_its_recordings_are_complete(self) -> None:
-        """Named, within the arm's reach, with files that exist below the root."""
+        """Recordings have names, poses within reach, and files that exist below the root."""
         archive = self.read()
         require(archive.recordings, "no recordings")
         check_ids(archive)
@@ -157,7 +157,7 @@ class ReaderConformance(Conformance):
                 require(recording.cloud.is_file(), f"{recording.id}: no file {recording.cloud}")
 
     def test_what_is_no_such_archive_is_refused(self) -> None:
-        """An empty folder and a missing one: in one line."""
+        """An empty folder and a missing one are refused in one line."""
         with tempfile.TemporaryDirectory() as empty:
             for path in (Path(empty), Path(empty) / "missing"):
                 require_refusal(lambda path=path: self.read(path), t.Rejected, str(path))  # type: ignore[misc]

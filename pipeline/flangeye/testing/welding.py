@@ -33,7 +33,7 @@ def straight_seam() -> t.Seam:
 
 
 class OnceConformance(Conformance):
-    """Base of the three: one answer a run."""
+    """Base of the conformance classes of scan, seam and weld stages: one answer per run."""
 
     gives: type
 

@@ -30,7 +30,7 @@ AngleUnit = Literal["rad", "deg"]
 _Token = Mapping[str, str | Any]
 
 NORM_TOLERANCE = 1e-3
-"""Of a quaternion: four printed digits pass, a wrong order of numbers does not."""
+"""Tolerance of a quaternion's length: four printed digits pass, other numbers do not."""
 
 EULER_ORDERS = tuple(
     "".join(axes)

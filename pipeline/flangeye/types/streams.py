@@ -109,9 +109,9 @@ class Truth:
     Attributes:
         camera: The camera's pose in the frame that carries it.
         others: The other unknowns of the configuration.
-        unseen: What a scanner without noise would see at poses that took no part: where the
-            flange (the target) really is, beside what the controllers report. They show what a
-            calibration is worth at the work where the arm has errors.
+        unseen: Observations without noise at poses not used for calibration: the true position of
+            the target, with the poses that the controllers report. They measure the calibration's
+            error at the work for an arm with errors.
     """
 
     camera: Transform

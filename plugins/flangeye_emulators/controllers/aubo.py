@@ -159,7 +159,7 @@ class AuboController(ControlUnit):
 
 
 MARK, _HEADER = b"SOF\x01", struct.Struct(">4sI")
-"""What begins a frame: the mark, and the length of what follows."""
+"""Header of a frame: the mark, and the length of the content."""
 
 
 def serve(options: EmulatorOptions) -> None:
@@ -289,4 +289,4 @@ METHODS: dict[str, Method] = {
     "RobotManage.poweroff": _method(AuboController.power_off),
     "RobotManage.setUnlockProtectiveStop": _method(AuboController.unlock),
 }
-"""By name, those of a robot without the robot's name in front."""
+"""Methods by name; those of a robot are without the robot's name in front."""

@@ -17,11 +17,11 @@ from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import SpringSurface
 
 PORT = 29998
-"""Of the control channel. It is here, for a client needs nothing of what serves it."""
+"""Port of the control channel. It is defined here because a client imports no server code."""
 
 
 OWN = ipaddress.IPv4Network("127.64.0.0/10")
-"""As many addresses of this machine as Linux has process numbers."""
+"""Loopback network of the emulators: as many addresses as Linux has process numbers."""
 
 
 def address_of(host: str) -> str:

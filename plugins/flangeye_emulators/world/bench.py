@@ -24,7 +24,7 @@ from flangeye_emulators.world.mesh import MATERIALS, Mesh, box, capsule
 from flangeye_emulators.world.raycast import SolidBody
 
 BENCH_MARGIN = 0.25
-"""From the workpiece's box to the edge of the bench, to each side [m]."""
+"""Distance from the workpiece's box to the bench's edge on each side [m]."""
 
 
 CLUTTER = 6

@@ -262,4 +262,4 @@ MATERIALS: Mapping[str, Material] = {
     "rubber": Material(albedo=0.03, grain=1.5),
     "table": Material(albedo=0.3),
 }
-"""By name; a flange's finish is one of the first three."""
+"""Materials by name; a flange has one of the first three."""

@@ -85,7 +85,7 @@ class CorrectedParams(Params):
     reader: Annotated[BoundPart, Choose("reader")]
     """Reader of the archive as it was recorded."""
     arms: Arms = "both"
-    """Whose poses, where there are two arms; one arm alone is 'both'."""
+    """Arm whose poses are corrected if there are two; 'both' with one arm."""
     robot: PoseMistake = Field(default_factory=PoseMistake)
     """What was wrong with the robot's poses."""
     target: PoseMistake = Field(default_factory=PoseMistake)

@@ -44,7 +44,7 @@ from flangeye_plugins.ros2.messages import Type, cloud_of, intrinsics_of, pixels
 
 Value = TypeVar("Value")
 ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
-"""How a recipe names its arm."""
+"""Remedy that states how a recipe names its arm."""
 
 
 class BagParams(Params):

@@ -51,7 +51,7 @@ from flangeye_plugins.reader.columns import (
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
 JOINTS = "joints"
-"""In place of a rotation: the poses follow from the joint angles."""
+"""Stands for a rotation: the poses follow from the joint angles."""
 
 
 class OtherParams(ColumnsParams):

@@ -11,7 +11,7 @@ from flangeye.types import Floats
 
 
 def thinned(points: NDArray[Any], voxel: float) -> Floats:
-    """Return the mean of the points in each occupied voxel."""
+    """Return (M, 3) means of the points (N, 3) in each occupied voxel of edge ``voxel`` [m]."""
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))

@@ -198,7 +198,7 @@ def test_a_log_of_ours_needs_no_recipe(
     log = tmp_path / "o" / "run.mcap"
     code, out, err = run(monkeypatch, capsys, log)
     assert (code, err) == (0, "")
-    assert out.startswith("8 of 8 samples have a target in them")
+    assert out.startswith("nothing found: 8 of 8 samples have a target in them")
     # A result that was changed afterwards is not a mistake of the samples, and is named beside them.
     raw = bytearray(log.read_bytes())
     raw[bytes(raw).rindex(b'"verified"') + 1] = ord("V")
@@ -262,8 +262,8 @@ def test_nothing_found_is_exit_code_zero(
 ) -> None:
     code, out, _ = run(monkeypatch, capsys, folder(session_of()))
     assert code == 0
-    assert out.splitlines()[0] == "20 of 20 samples have a target in them; 18 checks"
-    assert out.splitlines()[-1] == "nothing found"
+    verdict = "nothing found: 20 of 20 samples have a target in them; 18 checks"
+    assert out.splitlines()[0] == verdict
 
 
 def test_a_finding_is_exit_code_one_and_its_line_mends_it(

@@ -38,6 +38,7 @@ def tsai_lenz(motions: Motions) -> Floats:
 
 def _half_sines(vectors: Floats) -> Floats:
     """Return ``2 sin(angle / 2) axis`` of (K, 3) rotation vectors."""
+    # np.sinc(x) is sin(pi x) / (pi x): finite where the angle is zero
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors * np.sinc(angles / (2.0 * np.pi)))
 
@@ -80,11 +81,13 @@ def andreff(motions: Motions) -> Floats:
     n, identity = len(motions.a), np.eye(3)
     turns_a, turns_b = motions.a[:, :3, :3], motions.b[:, :3, :3]
     rows = np.zeros((n, 12, 12))
+    # vec() stacks rows here: vec(A X) = (A x 1) vec(X), vec(X B) = (1 x B') vec(X)
     rows[:, :9, :9] = np.einsum("nij,kl->nikjl", turns_a, identity).reshape(n, 9, 9)
     rows[:, :9, :9] -= np.einsum("ij,nlk->nikjl", identity, turns_b).reshape(n, 9, 9)
     rows[:, 9:, :9] = np.einsum("ij,nl->nijl", identity, motions.b[:, :3, 3]).reshape(n, 3, 9)
     rows[:, 9:, 9:] = identity - turns_a
     right = np.concatenate([np.zeros((n, 9)), motions.a[:, :3, 3]], axis=1)
     found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
+    # The nine numbers of a linear solution are no rotation under noise
     rotation = nearest_rotation(np.asarray(found[:9].reshape(3, 3), dtype=np.float64))
     return rigid(rotation, translation_of(rotation, motions))

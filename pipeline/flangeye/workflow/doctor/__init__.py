@@ -12,17 +12,17 @@ from flangeye.workflow.doctor.diagnosis import Diagnosis, Finding, Misfit
 
 
 def as_text(diagnosis: Diagnosis) -> str:
-    """Return the findings as text, a few lines each."""
+    """Return the verdict in one line, then the findings, a few lines each."""
     session = diagnosis.session
     head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
     checks = len(diagnosis.checks)
-    lines = [f"{head}; {checks} check{'s' * (checks != 1)}", *_idle(diagnosis)]
+    mistakes = len(diagnosis.findings)
+    found = f"{mistakes} mistake{'s' * (mistakes != 1)}" if mistakes else "nothing"
+    lines = [f"{found} found: {head}; {checks} check{'s' * (checks != 1)}", *_idle(diagnosis)]
     for number, finding in enumerate(diagnosis.findings, 1):
         lines += ["", f"{number}. {finding.name}: {finding.what}", *_details(finding)]
     for note in diagnosis.notes:
         lines += ["", f"note: {note.name}: {note.what}", *fix_lines(note, "   ")]
-    if not diagnosis.findings:
-        lines += ["", "nothing found"]
     return "\n".join(lines)
 
 

@@ -27,7 +27,7 @@ Reader = str | Mapping[str, Any]
 """A reader as a recipe writes it: its name, or its name and parameters."""
 
 Arms = Literal["both", "first", "second"]
-"""Whose poses: where there is one arm, ``both`` is that one."""
+"""Arms whose poses are read or corrected; with one arm, ``both`` is that arm."""
 
 FEWEST_SAMPLES = 4
 """Fewest samples; with fewer, any explanation fits."""

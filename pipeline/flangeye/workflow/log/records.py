@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 MAX_RECORD = 1 << 30
 """Largest record that is read [bytes]."""
 MAX_CHUNK = 1 << 28
-"""What one chunk may expand to [bytes]; a whole scan of the largest scanner has an eighth."""
+"""Largest expanded size of one chunk [bytes], eight times the largest scanner's whole scan."""
 SLACK, MAX_RATIO = 1 << 30, 100
-"""What all chunks together may: so much [bytes], and so many times what they take up."""
+"""Limit on the expanded size of all chunks: [bytes], and a multiple of their stored size."""
 HASHES = "flangeye.sha256"
 """Name of the metadata record that says an attachment's hash."""
 

@@ -200,7 +200,7 @@ class TargetSection(NamedSection):
     """robot: meshes in metres, by the number of the joint whose frame each is drawn in, the base's
     0; those of the URDF if not given."""
     unit: LengthUnit | None = None
-    """Of the mesh's coordinates; judged by its size if not given."""
+    """Unit of the mesh's coordinates; found from its size if not given."""
     at: Literal["flange", "base", "unknown"] = "flange"
     """The frame the mesh is drawn in; unknown: fixed to the arm's flange, drawn in a frame of its
     own, and its place is found."""

@@ -26,7 +26,7 @@ DIVERGING = [
     [0.65, "#e08a6d"],
     [1.0, "#b2182b"],
 ]
-"""From below the plane to above; grey in the middle, which shows on white and on black."""
+"""Colours from below the plane to above; the grey in the middle shows on white and on black."""
 
 
 def packed(values: Any) -> dict[str, str]:

@@ -21,7 +21,7 @@ from flangeye.workflow.report.look import SERIES
 AZIMUTH, ELEVATION = np.radians(-62.0), np.radians(20.0)
 """Where the picture is taken from, about the base: it shows an arm that reaches along x."""
 PIXELS = 'vector-effect="non-scaling-stroke"'
-"""For a line whose width is in pixels, whatever the picture's scale."""
+"""Attribute that keeps a line's width in pixels at any scale of the picture."""
 
 
 @dataclass(frozen=True, eq=False)

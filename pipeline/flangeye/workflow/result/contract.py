@@ -137,7 +137,7 @@ class VerificationResult(_Part):
     reason: str
     figures: dict[str, float]
     errors: dict[str, float]
-    """Per pose, by observation id [m]."""
+    """Error of each pose [m], by observation id."""
 
 
 class WorkspaceResult(_Part):
@@ -175,7 +175,7 @@ class TruthResult(_Part):
     errors: dict[str, TransformErrorResult] = Field(default_factory=dict)
     """Error of every unknown, at the point about which its covariance is taken."""
     error_at_centroid: float
-    """At the workspace's centre [m]."""
+    """Error at the workspace's centre [m]."""
     rms_over_workspace: float
     """Over the workspace box [m]."""
     rotation_error: float
@@ -237,9 +237,9 @@ class WeldResult(_Part):
     reason: str
     """Why it ended early; empty when it did not."""
     seconds: float
-    """From the first cycle to the last."""
+    """Time from the first cycle to the last."""
     correction_rms: float | None = None
-    """From the plan to the seam as it was felt, across it [m]."""
+    """Lateral distance from the plan to the measured seam [m]."""
     phases: dict[str, float]
     """Time in each phase of the controller [s]."""
     figures: dict[str, float]
@@ -263,7 +263,7 @@ class CorrectionResult(_Part):
     tool_offset: Point
     """The circle's centre in the flange frame [m]."""
     joint_offsets: Vector | None = None
-    """To add to the joint angles [rad]."""
+    """Offsets to add to the joint angles [rad]."""
     joints: Vector | None = None
     """A configuration on the branch of the arm that was calibrated [rad]."""
     lengths: Matrix | None = None
@@ -290,9 +290,9 @@ class AnswersResult(_Part):
     """The two answers, side by side: never mix the pose of one with the arm of the other."""
 
     as_reported: AnswerResult
-    """For the arm as its controller reports it."""
+    """Answer for the arm as its controller reports it."""
     corrected: AnswerResult | None = None
-    """For the arm with its error corrected; null: no error was found."""
+    """Answer for the arm with its error corrected; null if no error was found."""
 
 
 class StageTiming(_Part):

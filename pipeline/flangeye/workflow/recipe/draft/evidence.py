@@ -29,7 +29,7 @@ from flangeye.workflow.recipe.draft.headings import JOINTS, Headings, PoseColumn
 Key = TypeVar("Key")
 
 ROUNDED = 5e-3
-"""By how much a written quaternion's length, or a rotation matrix, may be off."""
+"""Tolerance of a written quaternion's length, and of a rotation matrix's orthogonality."""
 TURN = 2 * math.pi + 0.01
 """Angles [rad] beyond it are degrees."""
 
@@ -183,7 +183,7 @@ FEWEST_PAIRS = 5
 MOST_PAIRS = 60
 """Poses whose pairs are looked at: enough to distinguish frames."""
 CLEARER = 3.0
-"""By what factor the next best has to be worse, beyond 0.2 deg or 2 mm."""
+"""Factor by which the second-best reading must be worse, beyond 0.2 deg or 2 mm."""
 LOOSE_PLACE = 2e-3
 """Difference [m] below which two hypotheses are both good."""
 

@@ -16,7 +16,7 @@ from flangeye.models.robots import joints_in_order
 from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
 
 JOINTS = ("joints",)
-"""In place of a rotation: joint angles."""
+"""Stands for a rotation if the columns hold joint angles."""
 _PLACES = (
     "position", "pos", "translation", "trans", "tvec", "location", "origin", "t", "p", "xyz",
 )  # fmt: skip
