@@ -159,7 +159,7 @@ class Scan:
     """One exposure of a scanner, with its time.
 
     Attributes:
-        cloud: In ``camera`` [m].
+        cloud: Points in ``camera`` [m].
         started_ns: When the exposure began, by ``time.monotonic_ns``.
         ended_ns: When it ended.
         image: Image of the scanner's camera, if it has one and an image was requested.

@@ -217,7 +217,7 @@ def picture_of(cloud: Floats, flange: Floats) -> str:
 
 
 def small(image: NDArray[np.uint8]) -> str:
-    """Return an image (H, W) or (H, W, 3), red first, in a small picture's size: a data URL."""
+    """Return a small picture of an image (H, W) or (H, W, 3), RGB, as a data URL."""
     import cv2
 
     scale = min(np.array(SHOT) / image.shape[1::-1])

@@ -119,7 +119,7 @@ def fig13(batches: Path, out: Path) -> None:
 
 
 def _welds(batches: Path, workpiece: str) -> Welds:
-    """Return the welds of a workpiece by how it was followed."""
+    """Return the welds of a workpiece by the method that followed the seam."""
     others = read_sessions(batches / f"fig13-others_{workpiece}")
     mode = "steps.5.mode"
     sessions = {

@@ -49,7 +49,7 @@ class RealisationOutcome:
     Attributes:
         error: (6,) x, y, z [m], roll, pitch, yaw [rad] in ``camera``, at its origin.
         at_centre: (3,) displacement at the workspace's centre, in ``camera`` [m].
-        rms: Over the workspace [m].
+        rms: Rms error over the workspace [m].
         alone: The same of least squares on the poses that are not outliers [m].
         bound: Cramér-Rao, see :func:`bound`.
     """

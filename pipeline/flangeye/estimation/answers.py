@@ -158,7 +158,7 @@ class _Commands:
         return out
 
     def _explained(self, by: Floats, moved: Floats) -> Floats:
-        """Return (B, 6, K) least-squares coefficients, over each box, of (W, 6, 6) in (W, 6, K)."""
+        """Return (B, 6, K): ``moved`` (W, 6, K) fitted by ``by`` (W, 6, 6) over each of B boxes."""
         # Turns count like what they do so far from the flange [m]: enough to determine the turn
         # about a line where the work is in one, and no more, for the work is at positions
         weight = np.repeat([0.02, 1.0], 3)[:, None]

@@ -148,7 +148,8 @@ def most_informative(
         levers: (A, U) linear functions whose summed variance is minimised.
         count: How many to choose; all candidates, if there are fewer.
 
-        Returns: Indices of the chosen candidates, and the covariance (U, U) with them.
+    Returns:
+        Indices of the chosen candidates, and the covariance (U, U) with them.
     """
     chosen: list[int] = []
     for _ in range(min(count, len(rows))):

@@ -61,7 +61,7 @@ class Recording:
         camera_T_target: (4, 4) ready-made pose of a marker [m], if the archive has one.
         camera: (3, 3) camera matrix of the image [px] and OpenCV's distortion, if the archive has
             them.
-        axes: For a cell, position of each rail and positioner [m or rad].
+        axes: Position, in a cell, of each rail and positioner [m or rad].
         seen_by: The camera, for a cell.
         saw: The target, for a cell.
         motion: Trajectory of the (first) arm's flange around the capture, if recorded in motion.

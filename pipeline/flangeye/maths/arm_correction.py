@@ -109,7 +109,7 @@ def corrected_observation(
     """Return an observation with the flange's pose corrected; see :func:`corrected_flange`.
 
     Args:
-        observation: As it was recorded.
+        observation: The observation as recorded.
         correction: The arm's errors that the calibration found, if any.
         arm: Its kinematics; needed when joint offsets are corrected.
         flange: Name of the arm's flange frame.

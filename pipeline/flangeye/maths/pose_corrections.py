@@ -38,7 +38,7 @@ def reread(poses: Floats, read_as: str, written_as: str) -> Floats:
     """Return the poses with their rotation numbers read in another convention.
 
     Args:
-        poses: As they were read.
+        poses: The poses as read.
         read_as: How the rotations were read, as :class:`PoseConvention`
             names it.
         written_as: How they were written; of as many numbers.

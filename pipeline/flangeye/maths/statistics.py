@@ -108,7 +108,7 @@ def without_shared(observation: Observation, found: Floats) -> Observation:
     """Return an observation without the errors that its whole session shares.
 
     Args:
-        observation: As it was measured.
+        observation: The measured values.
         found: (k,) estimate of each error, in standard deviations; see :class:`HandEye`.
     """
     feature = observation.feature

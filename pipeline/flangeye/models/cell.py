@@ -136,7 +136,7 @@ class Cell:
     """The frames of a cell, its carriers, cameras and targets.
 
     Attributes:
-        frames: By name. The place of what moves is None here: observations have it.
+        frames: Frames by name. A moving frame's place is None here; observations have it.
         movers: The arm or axis that moves a frame; None for an arm without a model.
         cameras: Frames of cameras, in the recipe's order.
         targets: Frames of targets.

@@ -339,7 +339,7 @@ def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> F
     Args:
         grey: (H, W) values.
         rough: (4, 2) corners, to a pixel or two.
-        image: With the camera's matrix and distortion.
+        image: Image with the camera's matrix and distortion.
     """
     lines = [_side(grey, rough[i], rough[(i + 1) % 4], image) for i in range(4)]
     if any(line is None for line in lines):

@@ -58,9 +58,9 @@ class Calibration(Model):
     noise: tuple[Length, Length, Length]
     """Standard deviation of one measurement of the tip, in the tool's axes."""
     lateral: Stiffness | None = None
-    """Across the finger, at its tip."""
+    """Stiffness across the finger, at its tip."""
     axial: Stiffness | None = None
-    """Along the finger."""
+    """Stiffness along the finger."""
     source: str
 
 

@@ -21,7 +21,7 @@ class Topic(NamedTuple):
     """A topic that runs.
 
     Attributes:
-        name: With its namespace.
+        name: Name with its namespace.
         type: ``sensor_msgs/msg/PointCloud2``.
         publishers: Names of the nodes that publish it.
         subscribers: How many nodes listen.
@@ -37,7 +37,7 @@ class Running(NamedTuple):
     """A topic or a service that runs and that a recipe may use.
 
     Attributes:
-        name: With its namespace.
+        name: Name with its namespace.
         line: Line of text about it: its type, its rate, its publisher.
         answers: The option of ``flangeye init`` that may name it; empty where none does.
     """

@@ -241,7 +241,7 @@ def roll_angle(flat: Floats, flange: Flange) -> float | None:
 
     Args:
         flat: See :func:`match_holes`.
-        flange: Whose pattern to look for.
+        flange: Flange whose pattern is searched.
     """
     match = match_holes(flat, flange) if flange.pin is not None else None
     # On the published clouds the next best rotation scores below 0.9 of the right one.

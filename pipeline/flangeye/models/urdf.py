@@ -41,7 +41,7 @@ class Urdf:
     Attributes:
         path: Path of the file.
         name: Name of the robot.
-        links: By name.
+        links: Links by name.
         above: Link's name -> the joint that carries it.
     """
 

@@ -178,7 +178,7 @@ def numbers_of(
     Args:
         urdf: The file, for the message.
         element: What has it; None is as without it.
-        name: Of the attribute.
+        name: Name of the attribute.
         default: Its text where there is none.
         count: How many numbers the attribute has.
 

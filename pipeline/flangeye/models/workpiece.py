@@ -47,11 +47,11 @@ class SeamLine(Model):
 
     name: str
     points: tuple[Vector, ...] = Field(min_length=2)
-    """Along the root, in order."""
+    """Points along the root, in order."""
     opening: Vector | tuple[Vector, ...]
     """Direction out of the groove, towards the torch: one for all, or one a point."""
     half_angle: Angle | None = None
-    """Between a wall and the opening."""
+    """Angle between a wall and the opening."""
     half_width: Length | None = None
     """Lateral distance from the root to a shoulder."""
 
@@ -76,7 +76,7 @@ class CadSeam:
         points: (N, 3) along the root [m].
         openings: (N, 3) unit vectors towards the torch.
         half_angle: Between a wall and the opening [rad], if known.
-        half_width: From the root to a shoulder [m], if known.
+        half_width: Distance from the root to a shoulder [m], if known.
     """
 
     points: Floats
@@ -100,7 +100,7 @@ class Workpiece:
         unit: Unit of the CAD, as configured.
         vertices: (V, 3) [m].
         triangles: (T, 3) indices of vertices.
-        seams: By name.
+        seams: Seams by name.
     """
 
     title: str

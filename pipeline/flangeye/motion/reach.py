@@ -342,7 +342,7 @@ class Plan(NamedTuple):
     """Poses to visit, in their order.
 
     Attributes:
-        poses: In the order of their visit; a plan may choose each when it is asked for.
+        poses: Poses in the order of their visit; a plan may choose each when it is asked for.
         wanted: Number of poses if the arm could reach them all.
         centre: (3,) of the box they were wanted in, in ``base`` [m].
         size: (3,) edges of that box [m].

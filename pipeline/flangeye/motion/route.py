@@ -41,7 +41,7 @@ class Route(NamedTuple):
     """Legs to drive one after the other.
 
     Attributes:
-        legs: At least one.
+        legs: Legs of the route, at least one.
         via: Name of the posture on the way, if the straight way is barred.
     """
 

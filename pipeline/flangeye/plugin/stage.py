@@ -428,10 +428,10 @@ def part(
 
     Args:
         name: ``kind.name``.
-        simulated: For a robot: arm and time are simulated.
-        interactive: For a robot: it asks a person at the terminal.
-        passive: For a robot: it commands nothing, others move the arm.
-        simulation_only: For a controller: it is known to diverge and must not move a real arm.
+        simulated: Whether a robot's arm and time are simulated.
+        interactive: Whether a robot asks a person at the terminal.
+        passive: Whether a robot commands nothing because others move the arm.
+        simulation_only: Whether a controller is known to diverge and must not move a real arm.
 
     Raises:
         TypeError: The kind before the dot is not known, or the signature breaks its contract.

@@ -85,7 +85,7 @@ class Conformance:
 
         Args:
             given: Values by type, before the context and the kit's cell.
-            *arguments: By position, as parts are called.
+            *arguments: Positional arguments of the part.
         """
         plugin = self.plugin
         values = {**self._cell(), **self.context(), **(given or {})}

@@ -280,7 +280,7 @@ class Seam:
         covariance: (N, 3, 3) of each point: where it is on the workpiece, and the hand-eye pose,
             together [m^2]. Neighbours share most of it.
         half_angle: Between a wall and the opening [rad], or None where it is not known.
-        half_width: From the root's plane to a shoulder [m], or None where it is not known.
+        half_width: Distance from the root's plane to a shoulder [m], or None where it is not known.
         source: What it was planned from, as text.
         figures: How well that went, in SI units, by name.
         notes: Warnings and records.
@@ -339,7 +339,7 @@ class WeldReport:
         turn: (K,) angular velocity of the tool [rad/s].
         along: (K,) the torch's way along the plan; the lead-in is before zero [m].
         phases: K names of what the controller was doing.
-        figures: By name, in SI units.
+        figures: Figures by name, in SI units.
         loop: How the loop kept time, by name, in SI units; differs from run to run.
         notes: Warnings and records.
         sigma: (K,) standard deviation of the torch's place across the seam [m], or empty.

@@ -143,7 +143,7 @@ class HandEye:
         expected: The error to expect at the work; None where it was not estimated.
         true: The unknowns in the arms' true bases, with all that the arms may do wrong alike at
             every pose in their covariances: for metrology, not for sending the arm anywhere.
-        arms: In a cell, what it found wrong with each arm, by its name.
+        arms: Correction of each arm of a cell, by the arm's name.
         shared: (k,) how much it found of each error that the features share (such as the camera's,
             :class:`PoseFeature`), in standard deviations; none where it looked for none.
         without: Takes indices of pairs and returns the answer that the others give, where the

@@ -58,7 +58,7 @@ class PoseConvention:
             :data:`EULER_ORDERS`, in which angles are written in the order of their axes.
         length: Unit of the position.
         angle: Unit of a rotation vector's length and of angles; a quaternion has none.
-        makers: Whose controllers show and take poses so, as the catalogue of robots spells them.
+        makers: Makers whose controllers use this form, as the catalogue of robots spells them.
         program: Regular expression of a position in a program, a group for each number.
         program_length: Unit of the positions there.
     """

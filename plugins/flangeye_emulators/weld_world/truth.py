@@ -25,9 +25,9 @@ class ToolFile(FingerGeometry):
     """True finger and torch of a world, from a file that no controller reads."""
 
     lateral: Stiffness = param(gt=0)
-    """Across the finger, at its tip."""
+    """Stiffness across the finger, at its tip."""
     axial: Stiffness = param(gt=0)
-    """Along the finger."""
+    """Stiffness along the finger."""
 
 
 ToolPath = Annotated[

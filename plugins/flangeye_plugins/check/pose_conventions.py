@@ -48,7 +48,7 @@ class Reread(NamedTuple):
     """A session whose rotations were read again in another convention.
 
     Attributes:
-        session: With the rotations read again.
+        session: The session with rotations read in the other convention.
         whose: Which rotations, such as "the robot's rotations".
         read_as: Convention that the recipe states.
         written_as: Convention in which they were read again.

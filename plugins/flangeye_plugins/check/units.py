@@ -45,7 +45,7 @@ class OtherUnit(NamedTuple):
     """A session with some lengths read in another unit.
 
     Attributes:
-        session: With these lengths in the other unit.
+        session: The session with these lengths in the other unit.
         said: Unit in which they were read.
         meant: Unit in which they may be written.
         arms: Arms whose positions are concerned; None for the target's.

@@ -53,7 +53,7 @@ class FramesParams(NamedParams):
     """Frame that carries the camera; base or flange if not given. ROS drivers call the controller's
     own base by several names: for UR it is base, not base_link."""
     child: str | None = Field(None, pattern=FRAME)
-    """The camera's own frame, z its view; camera, or in a cell the camera's name, if not given."""
+    """The camera's frame (z forward). Default: camera, or the camera's name in a cell."""
 
     def carrier(self, pose: CalibratedPose) -> str:
         """Return the name of the frame that carries the camera."""

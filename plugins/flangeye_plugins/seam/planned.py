@@ -17,7 +17,7 @@ from flangeye.types.geometry import arc_lengths, rows_at
 from flangeye.units import Length, param
 
 SPACING = 2e-3
-"""Between planned points [m]."""
+"""Distance between planned points [m]."""
 
 
 class SeamParams(Params):

@@ -207,7 +207,7 @@ def prior_of(sightings: CheckSightings, variances: Floats) -> Prior:
     """Return the information of a calibration's own sightings, taken as one check.
 
     Args:
-        sightings: With the calibration's scans and the arm's noise in their covariances.
+        sightings: Sightings with the calibration's scans and the arm's noise in their covariances.
         variances: (6 + K,) prior variances of the camera's motion and the arm's weights.
     """
     told = _unmarginalised(sightings).summed(0, 1)

@@ -49,7 +49,7 @@ class Table:
     """Rows of one file, of a part of it, or of several files.
 
     Attributes:
-        name: As a recipe names it: FILE, FILE:PART, a pattern of files, or files side by side.
+        name: Name in a recipe: FILE, FILE:PART, a pattern of files, or files side by side.
         file: The first of it with the folder, for messages.
         heading: Names of the columns; empty without a heading.
         rows: Location and cells of each row.

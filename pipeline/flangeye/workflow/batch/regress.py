@@ -55,7 +55,7 @@ def compare(
     """Return each manifest's comparison of results with expectations, in their order.
 
     Args:
-        manifests: By their files.
+        manifests: Manifests by their files.
         out: Folder of the batch; what finished there with the same software is not run again.
         workers: Processes; None for one a core.
         registry: The plugins.

@@ -283,7 +283,7 @@ Change = Callable[[Floats], Floats]
 
 
 OR_ELSE = "  # or, if it is not: "
-"""Between two lines of which a person has to choose one."""
+"""Separates two lines of which a person has to choose one."""
 
 
 def as_yaml(value: Any) -> str:

@@ -207,7 +207,7 @@ class Panel:
         id: Identifier of the capture.
         why: Why this one is shown.
         facts: Name and value, for the caption.
-        figure: For plotly, in the circle's own axes.
+        figure: Plotly figure in the circle's own axes.
     """
 
     id: str

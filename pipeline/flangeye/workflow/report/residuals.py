@@ -24,7 +24,7 @@ class Errors:
 
     Attributes:
         poses: The measured poses, in order.
-        residuals: By pose.
+        residuals: Residual of each pose.
         held_out: Step -> pose -> error of the verifications that have errors per pose.
     """
 

@@ -161,7 +161,7 @@ class TransformText:
         rotation: (roll, pitch, yaw) [deg].
         quaternion: (x, y, z, w).
         translation_std: (x, y, z) [mm], at ``about``.
-        rotation_std: About the parent's x, y, z [deg].
+        rotation_std: Standard deviations about the parent's x, y, z [deg].
         about: (x, y, z) [mm].
     """
 

@@ -177,7 +177,7 @@ class TruthResult(_Part):
     error_at_centroid: float
     """Error at the workspace's centre [m]."""
     rms_over_workspace: float
-    """Over the workspace box [m]."""
+    """Rms error over the workspace box [m]."""
     rotation_error: float
     """[rad]"""
     at_work: float | None = None
@@ -283,7 +283,7 @@ class AnswerResult(_Part):
     expected_rms: float | None = None
     """Error to expect at the work, rms [m]."""
     holdout_rms: float | None = None
-    """On poses held out, over all of them [m]."""
+    """Error on held-out poses, over all of them [m]."""
 
 
 class AnswersResult(_Part):

@@ -19,7 +19,7 @@ from flangeye_plugins.ros2.client import Bridge
 from flangeye_plugins.ros2.messages import Type, encoded, message
 
 RENEWAL = 0.025
-"""Between two pieces of a motion [s]."""
+"""Interval between two pieces of a motion [s]."""
 
 BEGINNING = pieces.BEHIND + 2 * RENEWAL
 """How long before now a piece begins [s]."""

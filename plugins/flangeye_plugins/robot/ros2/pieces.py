@@ -40,7 +40,7 @@ LAST = 0.03
 """What is left of a motion when its last piece is published: about a renewal [s]."""
 
 SAMPLE_TIME = 0.01
-"""Between the samples of a motion [s]."""
+"""Interval between samples of a motion [s]."""
 
 
 class Point(NamedTuple):

@@ -58,13 +58,13 @@ class ContactMeasurement(NamedTuple):
     Attributes:
         time: Time [s].
         s: Arc length.
-        offset: To the left of the plan.
+        offset: Offset to the left of the plan.
         angle: Angle of the tool [rad].
         aside: Offset to the left of the expected seam.
         spread: Variance of ``aside``: measurement and expectation [m^2].
         height: Height above the plan.
         deflection: Towards the pressed side.
-        compression: Into the joint.
+        compression: Compression into the joint.
     """
 
     time: float

@@ -341,7 +341,7 @@ async def _handed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) ->
 
 
 POLL = 0.1
-"""Between two looks for something new [s]."""
+"""Interval between two reads of the log [s]."""
 
 
 def watch_run(run: Path | None, port: int | None, console: Console, patience: float) -> RunView:

@@ -40,7 +40,7 @@ SEEN = re.compile(
     r"target|mark|cam|board|tag|aruco|pattern|checker|chess|fiducial|cent(er|re)|seen|sphere|object|"
     r"optical|track|detect|vision"
 )
-"""In the name of what a camera measured."""
+"""Words in column names of camera measurements."""
 
 _ARM = re.compile(
     r"robot|arm|joint|gripper|flange|(?<!eye.in.)hand(?!.?eye)|tool|tcp|effector|"
@@ -111,7 +111,7 @@ class PoseColumns:
 
     @property
     def name(self) -> str:
-        """How people call it: the file, and behind a colon the columns' name."""
+        """Name for messages: the file, then a colon and the columns' name."""
         return ":".join(filter(None, (self.table.name, self.called)))
 
     @property

@@ -307,7 +307,7 @@ def printed_target(images: Iterable[tuple[str, Any]], questions: Questions) -> d
 
     Args:
         images: Names, and pixels (H, W) or (H, W, 3).
-        questions: For the target.
+        questions: Questions about the target.
 
     Raises:
         RecipeError: The answer is missing, or is none.
