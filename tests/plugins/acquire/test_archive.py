@@ -326,8 +326,8 @@ def test_a_verification_cloud_that_is_also_trained_with_is_refused(
 ) -> None:
     shutil.copy(archive / "check.pcd", archive / "two.pcd")
     assert refused() == (
-        f"{archive}/two.pcd: is the verification cloud check.pcd again; a cloud that verifies must "
-        "not be calibrated with"
+        f"{archive}/two.pcd: is the verification cloud check.pcd again; a verification cloud "
+        "must not be used to calibrate"
     )
 
 

@@ -378,7 +378,7 @@ def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
     near = PointCloud(CAMERA, points_around(points, looks, aside))
     laid = FlangeCloud(near, aside[:3, 3], np.array([0, 0, -1.0]), aside)
     told = fit_body(laid, plate, FitBodyParams(), SCANNER)
-    assert "it rests on other edges than its own" in told.reason
+    assert "the fit used edges of another object" in told.reason
     assert not trial("ring-plate", 23).found
 
 

@@ -89,8 +89,8 @@ CASES = {
     duplicated_poses:
         ": poses '01' and '04' are the same; every capture needs a pose of its own; 'flangeye doctor' names those to leave out",
     a_verification_cloud_that_is_trained_on:
-        "/02.pcd: is the verification cloud 04.pcd again; a cloud that verifies must not be "
-        "calibrated with",
+        "/02.pcd: is the verification cloud 04.pcd again; a verification cloud must not be "
+        "used to calibrate",
 }  # fmt: skip
 """What is said of each; ``*`` stands for readers that are not named here."""
 
