@@ -159,11 +159,14 @@ def test_the_command_writes_the_page_and_prints_it(run: Path, tmp_path: Path) ->
     assert len(re.findall(rb"/Type\s*/Page[^s]", printed.read_bytes())) <= 2
 
 
-@pytest.mark.parametrize("printed", ["true", 'printf %%PDF-1.4 > "$to"'])
+@pytest.mark.parametrize(
+    "printed",
+    ["true", 'printf %%PDF-1.4 > "$to"', 'printf "%%PDF-1.4 %%%%EOF" > "$to"; kill -5 $$'],
+)
 def test_a_pdf_that_is_not_whole_is_said_and_the_old_one_stays(
     printed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What Chromium leaves on a full disk: nothing, or a part, and no word."""
+    """What Chromium leaves on a full disk: nothing, or a part, and no word; or it is killed."""
     browser = tmp_path / "bin" / "chromium"
     browser.parent.mkdir()
     find = "for word; do case $word in --print-to-pdf=*) to=${word#*=};; esac; done"
@@ -173,8 +176,9 @@ def test_a_pdf_that_is_not_whole_is_said_and_the_old_one_stays(
     page, old = tmp_path / "certificate.html", tmp_path / "certificate.pdf"
     page.write_text("<p>new")
     old.write_bytes(b"%PDF-1.4 old %%EOF")
-    with pytest.raises(StageError, match=r"certificate.pdf: .* does not print"):
+    with pytest.raises(StageError, match=r"certificate.pdf: .* does not print") as error:
         print_pdf(page)
+    assert "--" not in str(error.value)  # the reason, not the command
     assert old.read_bytes() == b"%PDF-1.4 old %%EOF"
     assert {each.name for each in tmp_path.iterdir()} == {"bin", page.name, old.name}
 

@@ -75,13 +75,18 @@ def print_pdf(page: Path) -> Path | None:
         with tempfile.TemporaryDirectory(dir=page.parent) as folder:
             draft = Path(folder).resolve() / out.name
             command = [browser, *options, f"--print-to-pdf={draft}", page.resolve().as_uri()]
-            subprocess.run(command, check=True, capture_output=True, timeout=120)
+            ended = subprocess.run(command, check=False, capture_output=True, timeout=120)
             # On a full disk Chromium prints a part, or nothing, and ends as if all were well
-            if not draft.read_bytes().rstrip().endswith(b"%%EOF"):
-                raise StageError(f"{out}: {browser} does not print all of it")
+            if ended.returncode or not draft.read_bytes().rstrip().endswith(b"%%EOF"):
+                raise StageError(
+                    f"{out}: {browser} does not print all of it (exit code {ended.returncode}); "
+                    f"{page} is complete, print it yourself"
+                )
             draft.replace(out)
-    except (subprocess.SubprocessError, OSError) as error:
-        raise StageError(f"{out}: {browser} does not print: {error}") from None
+    except subprocess.TimeoutExpired:
+        raise StageError(f"{out}: {browser} does not print it within 120 s") from None
+    except OSError as error:
+        raise StageError(f"{out}: {browser} does not print: {error.strerror or error}") from None
     return out
 
 
