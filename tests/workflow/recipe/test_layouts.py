@@ -115,6 +115,13 @@ def side_by_side(f, j, a, s):
         (f / f"{name}.csv").write_text(text(vector(poses)))
 
 
+def beside_images(f, j, a, s):
+    side_by_side(f, j, a, s)
+    (f / "images").mkdir()
+    for k in range(COUNT):
+        cv2.imwrite(str(f / "images" / f"{k}.png"), np.zeros((8, 8), np.uint8))
+
+
 def storage(f, name, written):
     file = cv2.FileStorage(str(f / name), cv2.FILE_STORAGE_WRITE)
     for key, value in written:
@@ -667,6 +674,7 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "a remark behind `//`, and a blank line after each row": blank_lines,
     "`cam2target.csv`: the camera in the target": cam2target,
     "`gripper2base`, `cam2target`, `target2cam` side by side": side_by_side,
+    "the same beside images": beside_images,
     "OpenCV's storage, `robot_0`, `cam_0`, … matrices": opencv_numbered,
     "OpenCV's storage, `pose1: […]` in two files": opencv_lists,
     "OpenCV's storage, lists `Rotation_Vec` and `Translation_Vec`": opencv_vectors,

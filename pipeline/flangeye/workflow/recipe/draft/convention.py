@@ -57,6 +57,14 @@ def poses_of(table: Table) -> tuple[list[PoseColumns], Headings]:
     return poses_by_name(table) if table.heading else poses_by_number(table)
 
 
+def measured(tables: Sequence[Table]) -> PoseColumns | None:
+    """Return the poses that are named after a target, beside as many of the arm; None without."""
+    found = [pose for table in tables for pose in poses_of(table)[0] if pose.is_pose]
+    counts = {len(pose.table.rows) for pose in found if pose.role != "target"}
+    named = (p for p in found if p.role == "target" and len(p.table.rows) in counts)
+    return next(named, None)
+
+
 def table_params(
     tables: Sequence[Table], questions: Questions, robot: RobotModel | None, scans: bool
 ) -> dict[str, Any]:

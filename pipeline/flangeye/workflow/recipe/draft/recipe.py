@@ -31,7 +31,7 @@ from flangeye.models.urdf import robot_from_urdf
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import FLANGE, Floats, Observation, PoseFeature
-from flangeye.workflow.recipe.draft.convention import table_params
+from flangeye.workflow.recipe.draft.convention import measured, table_params
 from flangeye.workflow.recipe.draft.evidence import mounting_of, rotation_of
 from flangeye.workflow.recipe.draft.survey import FolderSurvey, Questions, one_of
 from flangeye.workflow.recipe.load import parse_recipe
@@ -127,7 +127,13 @@ def _reader(
     if any(p.name.startswith("pos0") and p.suffix in (".yaml", ".yml") for p in survey.files):
         return {"zivid": {"length": _length_of_files(questions)}}
     if survey.tables:
-        scans = bool(survey.clouds or survey.images)
+        # Of images it would have to be asked what they show
+        seen = None if questions.given.get("target") else measured(survey.tables)
+        scans = bool(survey.clouds or (survey.images and seen is None))
+        if survey.images and seen is not None and not scans:
+            questions.assumed.append(
+                f"what the camera saw: {seen.name}, not the images (--target says what they show)"
+            )
         try:
             read = {"table": table_params(survey.tables, questions, _model(robot), scans)}
             mended = {"corrected": {"reader": read, "target": questions.mended}}
