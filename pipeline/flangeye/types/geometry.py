@@ -69,11 +69,13 @@ def rotation_log(rotation: Floats) -> Floats:
     sines = 0.5 * _skew_part(r)
     length = np.sqrt((sines**2).sum(axis=-1, keepdims=True))
     cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1)[..., None] - 1.0)
-    # Near half a turn the sine is lost to rounding, and with it the axis; a quaternion keeps it
-    if (cosine < -0.9).any():
-        return _rotation_log_anywhere(r)
     ratio = np.arctan2(length, cosine) / np.maximum(length, 1e-300)
-    return np.asarray(sines * np.where(length < 1e-12, 1.0, ratio))
+    vectors = np.asarray(sines * np.where(length < 1e-12, 1.0, ratio))
+    # Near half a turn the sine is lost to rounding, and with it the axis; a quaternion keeps it
+    far = cosine[..., 0] < -0.9
+    if far.any():
+        vectors[far] = _rotation_log_anywhere(r[far])
+    return vectors
 
 
 def _skew_part(r: Floats) -> Floats:

@@ -25,7 +25,7 @@ import numpy as np
 
 from flangeye.estimation.readings import Pairs, estimated
 from flangeye.types import Floats, Indices, Mask
-from flangeye.types.geometry import hat, rotation_exp
+from flangeye.types.geometry import hat, rotation_exp, rotation_log
 from flangeye.workflow.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession
 from flangeye_plugins.check.equations import Equations, VariantUnknowns, equations_of, start_of
 
@@ -142,7 +142,7 @@ def _rotation_block(equations: Equations, unknowns: VariantUnknowns, mounts: Flo
     expected = turns @ unknowns.turn[:, None]
     seen = unknowns.rotation[:, None] @ equations.rotations
     # Taken on the left, in the carrier, so that the camera's rotation enters with derivative one.
-    residuals = log_of(seen @ expected.swapaxes(-1, -2))
+    residuals = rotation_log(seen @ expected.swapaxes(-1, -2))
     eye = np.broadcast_to(np.eye(3), (*residuals.shape, 3))
     zero = np.zeros_like(eye)
     parts = [eye, zero, *([zero] if unknowns.free_place else [])]
@@ -233,7 +233,8 @@ def _moved(unknowns: VariantUnknowns, step: Floats) -> VariantUnknowns:
     if unknowns.free_place:
         place = place + step[:, None, 6:9]
     if unknowns.free_turn:
-        turn = rotation_exp(step[:, 9:12]) @ turn
+        at = 9 if unknowns.free_place else 6
+        turn = rotation_exp(step[:, at : at + 3]) @ turn
     other = _moved_base(unknowns.other, step[:, -6:]) if unknowns.free_other else unknowns.other
     return unknowns._replace(
         rotation=turned,
@@ -273,29 +274,6 @@ def _score(
         unknowns,
         information,
     )
-
-
-def log_of(rotations: Floats) -> Floats:
-    """Return the rotation vectors (..., 3) [rad] of rotations (..., 3, 3).
-
-    Their lengths are accurate at any angle; their directions are inaccurate close to 180 deg.
-    """
-    twice_sine_axis = np.stack(
-        [
-            rotations[..., 2, 1] - rotations[..., 1, 2],
-            rotations[..., 0, 2] - rotations[..., 2, 0],
-            rotations[..., 1, 0] - rotations[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    length = np.linalg.norm(twice_sine_axis, axis=-1, keepdims=True)
-    trace = np.trace(rotations, axis1=-2, axis2=-1)[..., None]
-    # 2 sin and 2 cos of the angle: accurate at all angles, where arccos of the trace is not.
-    angle = np.arctan2(length, trace - 1.0)
-    away = np.broadcast_to([1.0, 0.0, 0.0], twice_sine_axis.shape)
-    direction = np.where(length > 1e-9, twice_sine_axis / np.maximum(length, 1e-9), away)
-    small = 0.5 * twice_sine_axis
-    return np.asarray(np.where(angle < 1e-6, small, angle * direction))
 
 
 @lru_cache(maxsize=2)

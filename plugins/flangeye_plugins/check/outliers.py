@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye import part
 from flangeye.types import Floats
-from flangeye.types.geometry import levers, rotation_exp
+from flangeye.types.geometry import levers, rotation_exp, rotation_log
 from flangeye.workflow.doctor.diagnosis import Finding, Findings, NotApplicable, RecordedSession
 from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
@@ -20,7 +20,6 @@ from flangeye_plugins.check.fitting import (
     exceedance,
     fit,
     fit_of,
-    log_of,
     negligible,
     offset_left_open,
 )
@@ -249,7 +248,7 @@ def _rotations(session: RecordedSession) -> tuple[float, float]:
 
 def _turns(poses: Floats) -> tuple[float, float]:
     turns = poses[:, :3, :3]
-    between = log_of(turns[:, None].swapaxes(-1, -2) @ turns[None]).reshape(-1, 3)
+    between = rotation_log(turns[:, None].swapaxes(-1, -2) @ turns[None]).reshape(-1, 3)
     # Principal axes of all pairwise rotation vectors: two of them must be long, since rotation
     # about one axis alone leaves the translation along it unknown (Tsai and Lenz 1989).
     _, _, axes = np.linalg.svd(between, full_matrices=False)

@@ -96,13 +96,13 @@ def alternate(given: Triple, starts: Triple, rounds: int = 3000) -> tuple[Triple
     ``trace((A X B)' Y C Z)``, which is linear in each of the three.
 
     Args:
-        given: Rotations of A, B, C, each (N, 3, 3).
-        starts: Initial rotations, each (..., 3, 3).
+        given: Rotations of A, B, C, each (N, 3, 3), or (K, N, 3, 3) of K problems at once.
+        starts: Initial rotations, each (..., 3, 3), or (K, ..., 3, 3).
         rounds: Largest number of steps.
     """
     a, b, c = given
-    form = np.einsum("nij,nkl,nmp->jkimpl", a, b, c).reshape(9, 9, 9)
-    forms = [np.moveaxis(form, i, 2).reshape(81, 9) for i in range(3)]
+    form = np.einsum("...nij,...nkl,...nmp->...jkimpl", a, b, c).reshape(*a.shape[:-3], 9, 9, 9)
+    forms = [np.moveaxis(form, i, -1).reshape(*a.shape[:-3], 81, 9) for i in (-3, -2, -1)]
     x, y, z = starts
     before = np.full(x.shape[:-2], -np.inf)
     for _ in range(rounds):
@@ -111,18 +111,18 @@ def alternate(given: Triple, starts: Triple, rounds: int = 3000) -> tuple[Triple
         moved = _third(forms[2], x, y)
         z = nearest_rotation(moved)
         agreement = (moved * z).sum(axis=(-2, -1))
-        if (agreement - before < 1e-10 * len(a)).all():
+        if (agreement - before < 1e-10 * a.shape[-3]).all():
             break
         before = agreement
     # |R - 1|^2 = 2 * angle^2 for small angles, and 6 - 2 trace(R) in general.
-    return (x, y, z), np.sqrt(np.maximum(3.0 - agreement / len(a), 0.0))
+    return (x, y, z), np.sqrt(np.maximum(3.0 - agreement / a.shape[-3], 0.0))
 
 
 def _third(form: Floats, first: Floats, second: Floats) -> Floats:
-    """Return (..., 3, 3): a trilinear form (81, 9) contracted with two of its arguments."""
-    shape = first.shape
-    products = first.reshape(-1, 9, 1) * second.reshape(-1, 1, 9)
-    return np.asarray((products.reshape(-1, 81) @ form).reshape(shape))
+    """Return (..., 3, 3): a trilinear form (..., 81, 9) contracted with two of its arguments."""
+    lead, shape = form.shape[:-2], first.shape
+    products = first.reshape(*lead, -1, 9, 1) * second.reshape(*lead, -1, 1, 9)
+    return np.asarray((products.reshape(*lead, -1, 81) @ form).reshape(shape))
 
 
 def random_rotations(rng: np.random.Generator, count: tuple[int, ...] = ()) -> Triple:
