@@ -72,9 +72,9 @@ def test_what_stands_still_lies_in_one_place_when_the_camera_moves(tmp_path: Pat
     drawing = cell_drawing(logged(tmp_path / "r.mcap"))
     assert drawing.frame == "the robot's base"
     seen = {x["name"]: columns(x) for x in drawing.figure["data"] if "name" in x}
-    centres = seen["the target's centre as the camera saw it from each"]
+    centres = seen["target where it was seen"]
     assert np.allclose(centres, TARGET[:3, 3], atol=1e-6)
-    assert np.ptp(seen["the camera at every capture"], axis=0).min() > 0.05
+    assert np.ptp(seen["camera at every sighting"], axis=0).min() > 0.05
 
 
 def test_a_camera_on_a_link_is_drawn_in_the_links_frame(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ from flangeye.files.paths import bundled
 from flangeye.plugin.registry import load_registry
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.recipe.load import load_recipe
+from flangeye.workflow.report.cell import cell_drawing
 from flangeye.workflow.report.facts import Facts, facts_of
 from flangeye.workflow.report.page import render
-from flangeye.workflow.report.space import graph_drawing
 from flangeye.workflow.run.folder import RunFolder
 from flangeye.workflow.run.session import Start, record_run
 
@@ -37,7 +37,7 @@ def columns(trace: Any) -> Any:
 
 
 def test_what_stands_still_is_seen_in_one_place_by_a_camera_that_moves(facts: Facts) -> None:
-    drawing: Any = graph_drawing(facts)
+    drawing: Any = cell_drawing(facts)
     at = {
         x["name"]: columns(x) for x in drawing.figure["data"] if "where it was" in x.get("name", "")
     }
@@ -53,9 +53,9 @@ def test_what_stands_still_is_seen_in_one_place_by_a_camera_that_moves(facts: Fa
 
 @pytest.mark.parametrize("recipe", ["", "title: T", "cell: {arms: {arm: gone}}"])
 def test_nothing_is_drawn_of_a_cell_that_cannot_be_read(facts: Facts, recipe: str) -> None:
-    assert graph_drawing(replace(facts, recipe=recipe)) is None
+    assert cell_drawing(replace(facts, recipe=recipe)) is None
 
 
 def test_nothing_is_drawn_before_all_was_found(facts: Facts) -> None:
     result = facts.result.model_copy(update={"transforms": {}})
-    assert graph_drawing(replace(facts, result=result)) is None
+    assert cell_drawing(replace(facts, result=result)) is None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +13,14 @@ import numpy as np
 from flangeye import types as t
 from flangeye.errors import FlangeyeError
 from flangeye.maths.statistics import rms
+from flangeye.models.cell import Cell
 from flangeye.models.loading import load_model
 from flangeye.types import Floats
-from flangeye.types.geometry import basis_of_plane
+from flangeye.types.geometry import basis_of_plane, each_applied
 from flangeye.workflow.log.foxglove import circle_lines
+from flangeye.workflow.recipe.cell import cell_of
 from flangeye.workflow.recipe.context import body_of
-from flangeye.workflow.recipe.header import TargetSection
+from flangeye.workflow.recipe.header import CellSection, Header, TargetSection
 from flangeye.workflow.recipe.own_models import carried_files
 from flangeye.workflow.report.facts import Facts
 from flangeye.workflow.report.look import SERIES
@@ -42,25 +45,32 @@ AXES = 0.2
 
 
 def cell_drawing(facts: Facts) -> PlotlyFigure | None:
-    """Return a drawing of clouds, workspace and frames.
+    """Return a drawing of clouds, workspace and frames; None if a pose is missing.
 
-    The drawing is in the base for a fixed camera, and also for one on the flange, with each capture
-    at the camera's pose; static objects must then coincide. For a camera on a link, whose pose is
-    not in the log, it is in the link's frame.
+    Of a camera on the flange and of cells it is in the base, with each capture at its camera's
+    pose; static objects must then coincide. For a camera on a link, whose pose is not in the log,
+    it is in the link's frame.
     """
-    found = facts.estimate
+    seen, found = facts.log.observations(), facts.estimate
+    if facts.of_cell:
+        cell = _cell_of(facts)
+        places = {n: t.Transform.named(n, x.matrix) for n, x in facts.result.transforms.items()}
+        if cell is None or not {*cell.unknowns} <= {*places}:
+            return None
+        return _from_each(facts, cell.ends(places, seen).camera, "the cell's base")
     carrier = found[0].partition("_T_")[0] if found else t.BASE
-    if carrier == t.FLANGE:
-        return _from_moving_camera(facts)
     pose = np.array(found[1].matrix) if found else None
+    if carrier == t.FLANGE and pose is not None:
+        poses = np.array([o.base_T_flange.matrix @ pose for o in seen])
+        return _from_each(facts, poses, in_words(t.BASE)) if seen else None
     traces = target_centres(facts, carrier, pose, size=2.5)
-    seen = "as the robot reports it" if carrier == t.BASE else "as the camera saw it"
-    shown = [f"the {'flange' if carrier == t.BASE else 'target'}'s centre {seen}"] if traces else []
+    saw = "as the robot reports it" if carrier == t.BASE else "as the camera saw it"
+    shown = [f"the {'flange' if carrier == t.BASE else 'target'}'s centre {saw}"] if traces else []
     if pose is not None:
         body = found_body(facts)
         drawn = [
             *_flanges(facts, pose),
-            *_scan(facts, pose, body and body.capture),
+            *_scans(facts, {o.id: pose for o in seen}, body and body.capture),
             *_circles(facts, pose),
             *_targets([pose @ m for m in _marker_poses(facts).values()]),
             *(_body(body, pose) if body else ()),
@@ -75,41 +85,53 @@ def cell_drawing(facts: Facts) -> PlotlyFigure | None:
     traces += frame(np.eye(4), carrier, AXES)
     if pose is not None:
         traces += frame(pose, t.CAMERA, AXES)
-    return _drawing(traces, shown, carrier)
+    return _drawing(traces, shown, in_words(carrier))
 
 
-def _from_moving_camera(facts: Facts) -> PlotlyFigure | None:
-    """Return a drawing in the base with a moving camera's poses and clouds."""
-    if facts.estimate is None:
-        return None
-    eye = np.array(facts.estimate[1].matrix)
-    cameras = {o.id: o.base_T_flange.matrix @ eye for o in facts.log.observations()}
-    if not cameras:
-        return None
-    markers, body = _marker_poses(facts), found_body(facts)
-    shown = body.capture if body else next(iter(cameras))
-    centres = [
-        mapped(cameras[o.id], o.centre_in_camera)
-        for o in facts.measured
-        if o.id in cameras and o.centre_in_camera
-    ]
-    at = np.array([m[:3, 3] for m in cameras.values()])
+def _cell_of(facts: Facts) -> Cell | None:
+    """Return the cell of a run's recipe, with the user-defined models from the log.
+
+    None if it cannot be read, for example from another version; the rest of the page is drawn.
+    """
+    with suppress(FlangeyeError, ValueError), carried_files(facts.log.models) as folder:
+        section = CellSection.model_validate(facts.header.get("cell"))
+        header = Header.model_construct(title="", steps=[], cell=section)
+        return cell_of(header, partial(load_model, "robots", near=folder), lambda *_: None)
+    return None
+
+
+def _from_each(facts: Facts, poses: Floats, words: str) -> PlotlyFigure:
+    """Return a drawing of what was seen from (N, 4, 4) camera poses, one for each observation."""
+    seen, body = facts.log.observations(), found_body(facts)
+    centres = each_applied(poses, np.array([o.feature.centre for o in seen]))
+    by_camera, by_target = (_rows([getattr(o, end) for o in seen]) for end in ("camera", "target"))
+    at = {o.id: pose for o, pose in zip(seen, poses, strict=True)}
     drawn = [
-        points(at, SERIES["used"], 3, name="the camera at every capture"),
-        points(
-            centres, SERIES["circle"], 3, name="the target's centre as the camera saw it from each"
+        *(
+            points(poses[rows, :3, 3], SERIES["used"], 3, name=f"{plain(x, 40)} at every sighting")
+            for x, rows in by_camera.items()
+            if np.ptp(poses[rows, :3, 3], axis=0).max() > 0
         ),
-        *_targets([cameras[k] @ m for k, m in markers.items() if k in cameras]),
-        *_scan(facts, cameras[shown], shown),
-        *(_body(body, cameras[shown]) if body else ()),
+        *(
+            points(centres[rows], SERIES["circle"], 3, name=f"{plain(x, 40)} where it was seen")
+            for x, rows in by_target.items()
+        ),
+        *_targets([at[k] @ m for k, m in _marker_poses(facts).items()]),
+        *_scans(facts, at, body and body.capture),
+        *(_body(body, at[body.capture]) if body else ()),
     ]
-    traces = [*drawn, *frame(np.eye(4), t.BASE, AXES)]
-    traces += frame(cameras[shown], t.CAMERA, AXES / 2)
-    return _drawing(traces, list(dict.fromkeys(str(x["name"]) for x in drawn)), t.BASE)
+    first = {x: at[body.capture] if body else poses[rows[0]] for x, rows in by_camera.items()}
+    axes = [trace for name, pose in first.items() for trace in frame(pose, name, AXES / 2)]
+    shown = list(dict.fromkeys(str(x["name"]) for x in drawn))
+    return _drawing([*drawn, *frame(np.eye(4), t.BASE, AXES), *axes], shown, words)
 
 
-def _drawing(traces: list[Trace], shown: list[str], name: str) -> PlotlyFigure:
-    words = in_words(name)
+def _rows(names: list[str]) -> dict[str, list[int]]:
+    """Return the rows of each name."""
+    return {name: [i for i, each in enumerate(names) if each == name] for name in names}
+
+
+def _drawing(traces: list[Trace], shown: list[str], words: str) -> PlotlyFigure:
     axes = "Axes are x red, y green, z blue."
     return PlotlyFigure(figure3d(traces), words, f"In {words}: {', '.join(shown)}. {axes}")
 
@@ -188,15 +210,24 @@ def _flanges(facts: Facts, pose: Floats) -> list[Trace]:
     return [points(mapped(pose, xyz), SERIES["used"], 1.5, name=name)]
 
 
-def _scan(facts: Facts, pose: Floats, capture: str | None) -> list[Trace]:
-    """Return one scan, by default the first, for a visual check of its place in the cell."""
-    every = facts.log.captures()
-    first = next((each for each in every if capture in (None, each.id)), None)
-    if first is None:
-        return []
-    xyz = thinned(first.cloud.points(), 3_000)
-    name = f"scan {plain(first.id, 40)}"
-    return [points(mapped(pose, xyz), SERIES["held_out"], 1.2, name=name)] if len(xyz) else []
+def _scans(facts: Facts, at: Mapping[str, Floats], only: str | None) -> list[Trace]:
+    """Return a scan of each camera, by default its first, to see its place in the cell.
+
+    Args:
+        facts: Facts of the run.
+        at: (4, 4) pose of the camera at each observation.
+        only: The capture to show.
+    """
+    found: dict[str, Trace] = {}
+    cameras = len({o.camera for o in facts.log.observations()})
+    for each in facts.log.captures():
+        if each.id in at and only in (None, each.id):
+            xyz = mapped(at[each.id], thinned(each.cloud.points(), 3_000))
+            name = f"scan {plain(each.id, 40)}"
+            found.setdefault(each.camera, points(xyz, SERIES["held_out"], 1.2, name=name))
+            if len(found) == cameras or only:
+                break
+    return [trace for trace in found.values() if len(trace["xyz"])]
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from flangeye.workflow.report.facts import (
 from flangeye.workflow.report.look import LOGO, SERIES, templates
 from flangeye.workflow.report.plot import Figure, layout2d, plain, round_up
 from flangeye.workflow.report.residuals import errors_of, residual_figure
-from flangeye.workflow.report.space import graph_drawing, workspace_drawing
+from flangeye.workflow.report.space import workspace_drawing
 from flangeye.workflow.report.still import scene_of, still
 from flangeye.workflow.report.summary import (
     TransformText,
@@ -123,7 +123,7 @@ def _content(facts: Facts) -> dict[str, Any]:
         "image": image_view(facts),
         "missed": missed_view(facts),
         "still": _still(facts),
-        "cell": graph_drawing(facts) if facts.of_cell else cell_drawing(facts),
+        "cell": cell_drawing(facts),
         "drawings": drawings_of(facts),
         "seam": seam_view(facts),
         "weld": weld_drawing(facts),

@@ -1,39 +1,26 @@
-"""The error over the workspace, and cells of many cameras and targets, each in its root frame."""
+"""The error over the workspace, in the frame of the camera's pose."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from flangeye import types as t
-from flangeye.errors import FlangeyeError
-from flangeye.models.cell import Cell
-from flangeye.models.configuration import Ends
-from flangeye.models.loading import load_model
-from flangeye.types import BASE, Floats, Observation, Transform
-from flangeye.types.geometry import covariance_at, each_applied
-from flangeye.workflow.recipe.cell import cell_of
-from flangeye.workflow.recipe.header import CellSection, Header
-from flangeye.workflow.recipe.own_models import carried_files
+from flangeye.types import Floats
+from flangeye.types.geometry import covariance_at
 from flangeye.workflow.report.facts import Facts
 from flangeye.workflow.report.look import SERIES
 from flangeye.workflow.report.plot import (
     Trace,
     box_edges,
     figure3d,
-    frame,
     lines,
     packed,
     plain,
-    points,
     round_up,
     scatter3d,
-    thinned,
 )
 from flangeye.workflow.report.units import millimetres
 
@@ -156,72 +143,3 @@ def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, floa
     segments = [np.stack([p, p + scale * d]) for p, d in zip(grid, shift, strict=True)]
     trace = lines(segments, SERIES["truth"], 4, name=f"true error × {scale:g}")
     return trace, scale, millimetres(largest)
-
-
-def graph_drawing(facts: Facts) -> PlotlyFigure | None:
-    """Return a drawing of camera poses and sighted targets; None if a pose is missing."""
-    cell, seen = _cell_of(facts), facts.log.observations()
-    found = {name: Transform.named(name, x.matrix) for name, x in facts.result.transforms.items()}
-    if cell is None or not seen or not {*cell.unknowns} <= {*found}:
-        return None
-    ends = cell.ends(found, seen)
-    drawn = [*_cameras(cell, seen, ends), *_targets(cell, seen, ends), *_scans(facts, seen, ends)]
-    shown = ", ".join(str(trace["name"]) for trace in drawn)
-    axes = 0.2  # length of the axes of the root and of cameras [m]
-    traces = [*drawn, *frame(np.eye(4), BASE, axes)]
-    for camera in cell.cameras:
-        traces += [t for pose in _of(camera, seen, ends)[:1] for t in frame(pose, camera, axes / 2)]
-    words = "the cell's base"
-    summary = (
-        f"In {words}: {shown}. Axes are x red, y green, z blue, of cameras at their first sighting."
-    )
-    return PlotlyFigure(figure3d(traces), words, summary)
-
-
-def _cell_of(facts: Facts) -> Cell | None:
-    """Return the cell of a run's recipe, with the user-defined models from the log.
-
-    None if it cannot be read, for example from another version; the rest of the page is drawn.
-    """
-    with suppress(FlangeyeError, ValueError), carried_files(facts.log.models) as folder:
-        section = CellSection.model_validate(facts.header.get("cell"))
-        header = Header.model_construct(title="", steps=[], cell=section)
-        return cell_of(header, partial(load_model, "robots", near=folder), lambda *_: None)
-    return None
-
-
-def _of(camera: str, seen: Sequence[Observation], ends: Ends) -> Floats:
-    """Return a camera's poses (N, 4, 4) at its observations."""
-    return ends.camera[[o.camera == camera for o in seen]]
-
-
-def _cameras(cell: Cell, seen: Sequence[Observation], ends: Ends) -> list[Trace]:
-    at = {camera: _of(camera, seen, ends)[:, :3, 3] for camera in cell.cameras}
-    return [
-        points(places, SERIES["used"], 3, name=f"{plain(camera, 40)} at every sighting")
-        for camera, places in at.items()
-        if len(places) and np.ptp(places, axis=0).max() > 0
-    ]
-
-
-def _targets(cell: Cell, seen: Sequence[Observation], ends: Ends) -> list[Trace]:
-    centres = each_applied(ends.camera, np.array([o.feature.centre for o in seen]))
-    at = {target: centres[[o.target == target for o in seen]] for target in cell.targets}
-    return [
-        points(places, SERIES["circle"], 3, name=f"{plain(target, 40)} where it was seen")
-        for target, places in at.items()
-        if len(places)
-    ]
-
-
-def _scans(facts: Facts, seen: Sequence[Observation], ends: Ends) -> list[Trace]:
-    """Return the first scan of each camera, thinned."""
-    at = {o.id: pose for o, pose in zip(seen, ends.camera, strict=True)}
-    first: dict[str, Trace] = {}
-    for capture in facts.log.captures():
-        if capture.id in at and capture.camera not in first:
-            # Of a scan that is drawn
-            xyz = mapped(at[capture.id], thinned(capture.cloud.points(), 3_000))
-            name = f"scan {plain(capture.id, 40)}"
-            first[capture.camera] = points(xyz, SERIES["held_out"], 1.2, name=name)
-    return [*first.values()]
