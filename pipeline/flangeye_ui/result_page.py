@@ -18,8 +18,8 @@ from flangeye.files.yaml_lines import parse_yaml
 from flangeye.models.robots import RobotModel
 from flangeye.types import HandEye
 from flangeye.units import parse_quantity
-from flangeye.workflow.doctor.diagnosis import Finding, examine
-from flangeye.workflow.doctor.opening import open_session
+from flangeye.workflow.doctor.diagnosis import Finding
+from flangeye.workflow.doctor.opening import examined
 from flangeye.workflow.report.cell import found_body
 from flangeye.workflow.report.facts import Facts, set_aside_of
 from flangeye.workflow.report.look import LIGHT, SERIES
@@ -427,10 +427,7 @@ class Doctor:
                 self._show(found)
 
     def _findings(self) -> tuple[Finding, ...]:
-        registry = self._project.registry
-        session = open_session(self._run / "run.mcap", registry)
-        checks = [part for part in registry.parts.values() if part.kind == "check"]
-        return examine(session, checks).findings
+        return examined(self._run / "run.mcap", self._project.registry).findings
 
     def _show(self, found: Finding) -> None:
         warning(f"{found.name}: {found.what}")

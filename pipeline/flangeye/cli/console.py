@@ -153,16 +153,8 @@ def _fail(error: FlangeyeError) -> NoReturn:
 
 def name_damage(log: RunLog) -> None:
     """Name every damaged part, and end as for bad input."""
-    for note in log.notes:
-        say(f"note: {note}", err=True)
+    say_notes(log.notes)
     log.require_sound()
-
-
-def require_gathered(log: RunLog) -> None:
-    """Refuse a log without captures or results."""
-    if not log.gathered:
-        log.require_sound()
-        raise StageError(f"{log.path}: the run ended early; nothing was gathered yet")
 
 
 @contextmanager

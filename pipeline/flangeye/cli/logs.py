@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
-from flangeye.cli.console import at_work, name_damage, of_foreign, require_gathered, say, say_notes
+from flangeye.cli.console import at_work, name_damage, of_foreign, say, say_notes
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 
 if TYPE_CHECKING:
@@ -60,14 +60,13 @@ def show(
 def _print_outlook(read: RunLog) -> None:
     from flangeye.workflow.run.outlook import outlook_of_log
 
-    require_gathered(read)
+    read.require_gathered()
     registry = load_plugins()
     with at_work("assessing the poses"), of_foreign(read.path, "it cannot be judged"):
         found = outlook_of_log(read, registry)
     for line in found.lines():
         say(line)
-    for note in read.notes:
-        say(f"note: {note}", err=True)
+    say_notes(read.notes)
 
 
 def _replay(log: Path) -> None:
@@ -98,7 +97,7 @@ def report(
 
     read = read_run(log)
     path = out or read.path.parent / "report.html"
-    require_gathered(read)
+    read.require_gathered()
     with at_work("report"), of_foreign(read.path, "no report can be made of it"):
         write_report(read, path)
     say(path)
@@ -208,9 +207,7 @@ def doctor(
     import json
 
     from flangeye.workflow.doctor import as_json, as_text
-    from flangeye.workflow.doctor.cells import examine_cell, open_cell
-    from flangeye.workflow.doctor.diagnosis import examine
-    from flangeye.workflow.doctor.opening import open_session
+    from flangeye.workflow.doctor.opening import examined
     from flangeye.workflow.log.read import log_of
     from flangeye.workflow.recipe.find import is_recipe
 
@@ -220,18 +217,14 @@ def doctor(
     checked = read_recipe(recipe, registry, overrides) if recipe else None
     if checked is not None and recipe == str(archive):
         archive = _archive_of(checked)
-    checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     with (
         of_foreign(archive, "it cannot be examined"),
-        at_work("looking for mistakes", len(checks)) as step,
+        at_work("looking for mistakes", len(registry.of_kind("check"))) as step,
     ):
-        cell = open_cell(archive, registry, checked)
-        if cell is None:
-            session = open_session(archive, registry, checked)
-            say_notes(session.damage)
-        diagnosis = examine_cell(cell) if cell else examine(session, checks, step)
+        diagnosis = examined(archive, registry, checked, step)
+    say_notes(diagnosis.damage)
     say(json.dumps(as_json(diagnosis), indent=2) if json_ else as_text(diagnosis))
-    if diagnosis.findings or diagnosis.session.damage:
+    if diagnosis.findings or diagnosis.damage:
         raise typer.Exit(1)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
-from flangeye.cli.console import at_work, of_foreign, say
+from flangeye.cli.console import at_work, of_foreign, say, say_notes
 from flangeye.errors import FlangeyeError, NothingMoved, StageError
 
 if TYPE_CHECKING:
@@ -198,23 +198,16 @@ def _after_verification(recipe: Recipe) -> list[str]:
 
 def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
     """Return the mistakes that the doctor finds in a run, the one that explains most first."""
-    from flangeye.workflow.doctor.cells import examine_cell, open_cell
-    from flangeye.workflow.doctor.diagnosis import examine
-    from flangeye.workflow.doctor.opening import open_session
+    from flangeye.workflow.doctor.opening import examined
 
-    checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
         with (
             of_foreign(log, "it cannot be examined"),
-            at_work("looking for the mistake", len(checks)) as checked,
+            at_work("looking for the mistake", len(registry.of_kind("check"))) as checked,
         ):
-            if cell := open_cell(log, registry, recipe):
-                found = examine_cell(cell)
-            else:
-                found = examine(open_session(log, registry, recipe), checks, checked)
+            return examined(log, registry, recipe, checked).findings
     except FlangeyeError:
         return ()  # the doctor needs more than this log has, and says so when it is asked
-    return found.findings
 
 
 def _recipe_of(
@@ -247,8 +240,7 @@ def _point(
     if source is None or at is None:
         return FromNothing()
     log = read_run(source)
-    for note in log.notes:
-        say(f"note: {note}", err=True)
+    say_notes(log.notes)
     if not log.gathered:
         raise StageError(f"{log.path}: nothing was gathered in it; there is nothing to run on")
     return restart_at(log, recipe, at, leave_out)

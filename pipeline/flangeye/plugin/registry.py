@@ -148,13 +148,14 @@ class Registry:
         exports = [self.stages[name] for name in self.stages if name.startswith("export.")]
         return [stage for stage in exports if set(stage.needs) == {"pose"}]
 
+    def of_kind(self, kind: str) -> list[Part]:
+        """Return the parts of a kind, in the order of their offering."""
+        return [self.parts[name] for name in self.parts if name.startswith(f"{kind}.")]
+
     def siblings(self, part: Part) -> Siblings:
         """Return the other parts of a part's kind, by the name a recipe gives them."""
-        return {
-            name.partition(".")[2]: self.parts[name]
-            for name in sorted(self.parts)
-            if name.startswith(f"{part.kind}.") and name != part.name
-        }
+        others = {each.name.partition(".")[2]: each for each in self.of_kind(part.kind)}
+        return {name: others[name] for name in sorted(others) if others[name].name != part.name}
 
     def versions(self) -> dict[str, str]:
         """Return each loaded plugin's entry point and the version of its distribution."""

@@ -17,8 +17,7 @@ from flangeye.workflow.batch import run_sessions
 from flangeye.workflow.batch.dataset import Dataset, Ledger, columns_of
 from flangeye.workflow.batch.outcome import Request, SessionOutcome
 from flangeye.workflow.batch.plan import BatchSession, plan, software_of
-from flangeye.workflow.doctor.diagnosis import examine
-from flangeye.workflow.doctor.opening import open_session
+from flangeye.workflow.doctor.opening import examined
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -160,9 +159,8 @@ def _closure(outcome: SessionOutcome, expected: Expected) -> str:
 
 
 def _findings(run: Path, registry: Registry) -> list[str]:
-    checks = [registry.part(name) for name in registry.parts if name.startswith("check.")]
     try:
-        return [f.name for f in examine(open_session(run, registry, None), checks).findings]
+        return [f.name for f in examined(run, registry).findings]
     except FlangeyeError as error:
         return [f"not examined: {error}"]
 

@@ -13,8 +13,7 @@ from flangeye.workflow.doctor.diagnosis import Diagnosis, Finding, Misfit
 
 def as_text(diagnosis: Diagnosis) -> str:
     """Return the verdict in one line, then the findings, a few lines each."""
-    session = diagnosis.session
-    head = f"{int(session.seen.sum())} of {len(session)} samples have a target in them"
+    head = f"{diagnosis.seen} of {diagnosis.samples} samples have a target in them"
     checks = len(diagnosis.checks)
     mistakes = len(diagnosis.findings)
     found = f"{mistakes} mistake{'s' * (mistakes != 1)}" if mistakes else "nothing"
@@ -82,9 +81,9 @@ def fix_lines(finding: Finding, indent: str) -> list[str]:
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the findings as plain data, SI units."""
     return {
-        "damage": list(diagnosis.session.damage),
-        "samples": len(diagnosis.session),
-        "seen": int(diagnosis.session.seen.sum()),
+        "damage": list(diagnosis.damage),
+        "samples": diagnosis.samples,
+        "seen": diagnosis.seen,
         "checks": list(diagnosis.checks),
         "not_applicable": dict(diagnosis.idle),
         "findings": [_plain(finding) for finding in diagnosis.findings],

@@ -39,7 +39,6 @@ from flangeye.workflow.doctor.diagnosis import (
     Diagnosis,
     Finding,
     Misfit,
-    RecordedSession,
     as_yaml,
     require_enough,
 )
@@ -194,15 +193,15 @@ def examine_cell(session: CellSession) -> Diagnosis:
     Raises:
         StageError: There are too few observations.
     """
-    counted = _session(session.observations)
-    require_enough(counted)
+    count = len(session.observations)
+    require_enough(count, count)
     some = replace(session, observations=_thinned(session.observations))
     before = predicted(some)
     found = [] if before.ordinary else _likeliest(some, before, suspicions(some))
     if not (found or before.ordinary):
         found = _likeliest(some, before, _of_links(some))
     found = found or _mispaired(session)
-    return Diagnosis(counted, tuple(found), (), ("cell",), {})
+    return Diagnosis(count, count, tuple(found), (), ("cell",), {})
 
 
 def _likeliest(
@@ -455,18 +454,3 @@ def _thinned(observations: Sequence[Observation]) -> list[Observation]:
         for of in _by_pair(observations).values()
         for i in np.unique(np.linspace(0, len(of) - 1, 12).round().astype(int))
     ]
-
-
-def _session(observations: Sequence[Observation]) -> RecordedSession:
-    """Return the sightings as the session that a finding counts its samples by."""
-    n = len(observations)
-    nothing = np.full((n, 3), np.nan)
-    return RecordedSession(
-        tuple(o.id for o in observations),
-        np.broadcast_to(np.eye(4), (n, 4, 4)),
-        np.array([o.feature.centre for o in observations]).reshape(-1, 3),
-        nothing,
-        np.full((n, 3, 3), np.nan),
-        nothing,
-        np.full(n, np.nan),
-    )

@@ -315,18 +315,22 @@ class Diagnosis:
     """All findings of the checks.
 
     Attributes:
-        session: The examined session.
+        samples: Number of samples.
+        seen: Number of samples with a target in them.
         findings: Findings in order, each made with the earlier ones corrected.
         notes: Information that is not a mistake.
         checks: Names of the checks.
         idle: Checks that do not apply to this session: name and reason.
+        damage: Damaged or changed parts of the log, one line each.
     """
 
-    session: RecordedSession
+    samples: int
+    seen: int
     findings: tuple[Finding, ...]
     notes: tuple[Finding, ...]
     checks: tuple[str, ...]
     idle: Mapping[str, str]
+    damage: tuple[str, ...] = ()
 
 
 def examine(
@@ -346,15 +350,23 @@ def examine(
         StageError: There are too few samples to judge.
     """
     bound = [check.bind() for check in checks]
+
+    def diagnosed(
+        found: Sequence[Finding], notes: tuple[Finding, ...], idle: Mapping[str, str]
+    ) -> Diagnosis:
+        names = tuple(check.part.name for check in bound)
+        seen = int(session.seen.sum())
+        return Diagnosis(len(session), seen, tuple(found), notes, names, idle, session.damage)
+
     found, current = [r for r in session.remarks if not r.note], session
     known = tuple(remark for remark in session.remarks if remark.note)
     if any(remark.hopeless for remark in found):
-        return Diagnosis(session, tuple(found), known, _names(bound), {})
-    require_enough(session)
+        return diagnosed(found, known, {})
+    require_enough(int(session.seen.sum()), len(session), session.remarks, session.damage)
     offered, idle = _offered(current, bound, checked)
     if made_up := [f for f in offered if f.hopeless]:
         # What else these samples seem to show is made up like them.
-        return Diagnosis(session, (*found, made_up[0]), known, _names(bound), idle)
+        return diagnosed([*found, made_up[0]], known, idle)
     while mendable := [f for f in offered if f.corrected_session is not None and not f.note]:
         # The likeliest first: a large mistake imitates and hides smaller ones, which are looked
         # for again once it is mended
@@ -370,11 +382,7 @@ def examine(
         offered = [f for f in offered if f.samples or f.name not in named]
     found += [f for f in offered if f.corrected_session is None and not f.note]
     notes = (*known, *(f for f in offered if f.note))
-    return Diagnosis(session, tuple(found), notes, _names(bound), idle)
-
-
-def _names(checks: Sequence[BoundPart]) -> tuple[str, ...]:
-    return tuple(check.part.name for check in checks)
+    return diagnosed(found, notes, idle)
 
 
 def _offered(
@@ -396,17 +404,19 @@ def _offered(
     return found, idle
 
 
-def require_enough(session: RecordedSession) -> None:
-    """Refuse a session with too few samples for any check.
+def require_enough(
+    seen: int, samples: int, remarks: Sequence[Finding] = (), damage: Sequence[str] = ()
+) -> None:
+    """Refuse a session with too few samples for any check, and say what else is known of it.
 
     Raises:
-        StageError: There are fewer.
+        StageError: The target is in fewer.
     """
-    seen = int(session.seen.sum())
     if seen < FEWEST_SAMPLES:
-        why = max(session.remarks, key=lambda remark: len(remark.samples), default=None)
+        why = max(remarks, key=lambda remark: len(remark.samples), default=None)
         raise StageError(
-            f"{seen} of {len(session)} samples have a target in them; at least {FEWEST_SAMPLES} "
+            f"{seen} of {samples} samples have a target in them; at least {FEWEST_SAMPLES} "
             "are needed to tell a mistake from noise"
             + (f"; {len(why.samples)} of them: {why.what}" if why else "")
+            + "".join(f"; {part}" for part in damage)
         )

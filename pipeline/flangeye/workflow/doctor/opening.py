@@ -6,7 +6,7 @@ the recipe's steps with placeholder poses, so that wrong poses have no influence
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,13 +27,16 @@ from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart, Params, Part
 from flangeye.types import Floats
 from flangeye.types.geometry import rigid
+from flangeye.workflow.doctor.cells import examine_cell, open_cell
 from flangeye.workflow.doctor.diagnosis import (
     FEWEST_SAMPLES,
+    Diagnosis,
     Finding,
     ReadAgain,
     Reader,
     RecordedSession,
     as_yaml,
+    examine,
 )
 from flangeye.workflow.log.read import RunLog, is_log, log_of, read_run
 from flangeye.workflow.recipe.load import Recipe
@@ -113,6 +116,29 @@ def _bare(session: RecordedSession, index: int, states: Mapping[str, State]) -> 
     )
 
 
+def examined(
+    path: Path,
+    registry: Registry,
+    recipe: Recipe | None = None,
+    checked: Callable[[], None] = lambda: None,
+) -> Diagnosis:
+    """Return the mistakes in an archive: a cell's on its whole graph, others' by every check.
+
+    Args:
+        path: A run.mcap, or a folder that a reader knows.
+        registry: The plugins on offer.
+        recipe: See :func:`open_session`.
+        checked: See :func:`examine`.
+
+    Raises:
+        StageError: The archive cannot be read, or holds too few samples to judge.
+    """
+    if cell := open_cell(path, registry, recipe):
+        return examine_cell(cell)
+    session = open_session(path, registry, recipe)
+    return examine(session, registry.of_kind("check"), checked)
+
+
 def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -> RecordedSession:
     """Return an archive as a session for checks.
 
@@ -136,9 +162,7 @@ def open_session(path: Path, registry: Registry, recipe: Recipe | None = None) -
 
 def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSession:
     log = read_run(path)
-    if not log.gathered:
-        log.require_sound()
-        raise StageError(f"{path}: the run ended early; nothing was gathered yet")
+    log.require_gathered()
     if recipe is None and log.has_recipe:
         recipe = recipe_of_log(log, registry, name=path.name)
     found = {o.id: o.feature for o in log.observations()}

@@ -169,6 +169,16 @@ class RunLog:
             more = f" (and {len(self.damage) - 1} more)" if len(self.damage) > 1 else ""
             raise StageError(f"{self.notes[0]}{more}")
 
+    def require_gathered(self) -> None:
+        """Refuse a log without captures or results.
+
+        Raises:
+            StageError: It is damaged, or the run ended early.
+        """
+        if not self.gathered:
+            self.require_sound()
+            raise StageError(f"{self.path}: the run ended early; nothing was gathered yet")
+
     def text(self, name: str) -> str | None:
         """Return an attached text, such as ``recipe.yaml``; None if it is not attached."""
         raw = self.attachments.get(name)
