@@ -19,6 +19,7 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused
 from flangeye.estimation.closed.comanipulation import best_rotations, with_translations
+from flangeye.estimation.closed.linear import entries, least_squares
 from flangeye.estimation.closed.motions import motions_of, place_of
 from flangeye.estimation.closed.separable import park_martin
 from flangeye.estimation.graph import Places, Problem, Sightings
@@ -101,7 +102,8 @@ def size_of(problem: Problem) -> float:
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
             turn = park_martin(motions_of(carried[rows], seen[rows]))[:3, :3]
             left, right = _sized_translations(carried, seen, turn)
-            found = _least(stack_rows(left[rows]), right[rows].ravel())
+            equations = stack_rows(left[rows]), right[rows].ravel()
+            found = np.asarray(np.linalg.lstsq(*equations, rcond=None)[0], dtype=np.float64)
             median = float(np.median(np.linalg.norm(left @ found - right, axis=1)))
             if median < least and 1 / largest < found[-1] < largest:
                 least, size = median, float(found[-1])
@@ -353,54 +355,35 @@ def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
 def _linear(loop: _Loop, rows: Indices) -> dict[str, Floats]:
     """Return camera and another place from centres, and normals where all have one.
 
-    ``A (R_X c + t_X)`` is the target's centre. It is linear in the entries of R_X and t_X, and in
-    those of the target's centre and axis in its carrier, or of R_Y and t_Y of a second base. The
-    rotations are then made orthonormal and the translations fitted again.
+    ``R_X c + t_X`` is the target's centre, before the camera's carrier. It is linear in the entries
+    of R_X and t_X, and in those of the target's centre and axis in its carrier, or of R_Y and t_Y
+    of a second base. The rotations are then made orthonormal and the translations fitted again.
     """
     s = loop.seen.where(rows)
-    a = invert(np.asarray(loop.target[0])[rows]) @ np.asarray(loop.camera[0])[rows]
+    between = invert(np.asarray(loop.camera[0])[rows]) @ np.asarray(loop.target[0])[rows]
     b, c = np.asarray(loop.target[2])[rows], np.asarray(loop.camera[2])[rows]
     own, points = each_applied(c, s.centres), each_applied(b, s.offsets)
-    n, of_place = len(s), np.abs(points - points[0]).max() < 1e-6
-    equations = np.zeros((n, 3, 24))
-    equations[:, :, :9] = np.einsum("nij,nk->nijk", a[:, :3, :3], own).reshape(n, 3, 9)
-    equations[:, :, 9:12] = a[:, :3, :3]
-    equations[:, :, 21:] = -np.eye(3)
-    if not of_place:
-        equations[:, :, 12:21] = -np.einsum("ij,nk->nijk", np.eye(3), points).reshape(n, 3, 9)
-    right = -a[:, :3, 3]
-    normals = c[:, :3, :3] @ s.rotations[:, :, 2, None]
+    normals = (c[:, :3, :3] @ s.rotations[:, :, 2, None])[..., 0]
+    of_place = np.abs(points - points[0]).max() < 1e-6
+    eye, turns, right = np.eye(3)[None, None], between[None, :, :3, :3], between[None, :, :3, 3]
+    of_centres = [entries(eye, own[None]), eye, -turns]
+    of_normals = [entries(eye, normals[None]), 0 * eye, 0 * turns]
+    if of_place:
+        of_centres, of_normals = [*of_centres, 0 * turns], [*of_normals, -turns]
+    else:
+        of_centres.append(-entries(turns, points[None]))
+        of_normals.append(-entries(turns, b[None, :, :3, 2]))
     has_normals = bool((s.ranks == 5).all())
-    every, sides = [stack_rows(equations)], [right.ravel()]
-    if has_normals:
-        more = np.zeros((n, 3, 24))
-        more[:, :, :9] = np.einsum("nij,nk->nijk", a[:, :3, :3], normals[..., 0]).reshape(n, 3, 9)
-        axes = b[:, :3, 2] if not of_place else np.zeros((n, 3))
-        if of_place:
-            more[:, :, 15:18] = -np.eye(3)  # the axis, in the place of entries that are not used
-        else:
-            more[:, :, 12:21] = -np.einsum("ij,nk->nijk", np.eye(3), axes).reshape(n, 3, 9)
-        every.append(stack_rows(more))
-        sides.append(np.zeros(3 * n))
-    found = _least(np.vstack(every), np.concatenate(sides))
+    systems = [(of_centres, right), (of_normals, 0 * right)]
+    found = least_squares(*systems[: 1 + has_normals])[0]
     x = nearest_rotation(found[:9].reshape(3, 3))
-    y = np.eye(3) if of_place else nearest_rotation(found[12:21].reshape(3, 3))
-    if of_place and has_normals:
-        y = _facing(found[15:18])
-    turned = np.zeros(24)
-    turned[:9] = x.ravel()
     if not of_place:
-        turned[12:21] = y.ravel()
-    shifts = [9, 10, 11, 21, 22, 23]
-    moved = _least(
-        stack_rows(equations[:, :, shifts]), right.ravel() - stack_rows(equations) @ turned
-    )
-    centre = moved[3:] - (y @ points[0] if of_place else 0.0)
-    return {str(loop.camera[1]): rigid(x, moved[:3]), str(loop.target[1]): rigid(y, centre)}
-
-
-def _least(rows: Floats, right: Floats) -> Floats:
-    return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0], dtype=np.float64)
+        y = nearest_rotation(found[15:].reshape(3, 3))
+    else:
+        y = _facing(found[15:]) if has_normals else np.eye(3)
+    onward = (turns @ (points @ y.T)[..., None])[..., 0]
+    moved = least_squares(([eye, -turns], right + onward - own @ x.T))[0]
+    return {str(loop.camera[1]): rigid(x, moved[:3]), str(loop.target[1]): rigid(y, moved[3:])}
 
 
 def _facing(axis: Floats) -> Floats:

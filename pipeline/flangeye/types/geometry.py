@@ -175,8 +175,9 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> Floats:
 
 
 def each_applied(transforms: Floats, points: Floats) -> Floats:
-    """Return (N, 3) points, each mapped by its own of (N, 4, 4) transforms."""
-    return np.asarray((transforms[:, :3, :3] @ points[:, :, None])[..., 0] + transforms[:, :3, 3])
+    """Return (..., 3) points, each mapped by its own of (..., 4, 4) transforms."""
+    turned = (transforms[..., :3, :3] @ points[..., None])[..., 0]
+    return np.asarray(turned + transforms[..., :3, 3])
 
 
 def stack_rows(blocks: Floats) -> Floats:

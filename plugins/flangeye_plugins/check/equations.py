@@ -23,8 +23,9 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.estimation.closed.comanipulation import alternate
+from flangeye.estimation.closed.linear import entries, least_squares
 from flangeye.types import Floats, Mask
-from flangeye.types.geometry import invert, nearest_rotation
+from flangeye.types.geometry import each_applied, invert, nearest_rotation
 from flangeye.workflow.doctor.diagnosis import RecordedSession
 
 
@@ -137,11 +138,11 @@ def start_of(equations: Equations) -> VariantUnknowns:
     other = np.tile(np.eye(4), (len(base), 1, 1))
     other[:, :3, :3] = base
     mounts, places = equations.carried(other), np.zeros((1, 1, 3)) if free else equations.places
-    right = _carried(mounts, places) - equations.centres @ camera.swapaxes(-1, -2)
+    right = each_applied(mounts, places) - equations.centres @ camera.swapaxes(-1, -2)
     parts = [np.eye(3)[None, None]]
     parts += [] if equations.bases is None else [-equations.bases[..., :3, :3]]
     parts += [-mounts[..., :3, :3]] if free else []
-    found = _least_squares((parts, right)).reshape(len(camera), -1, 3).swapaxes(0, 1)
+    found = least_squares((parts, right)).reshape(len(camera), -1, 3).swapaxes(0, 1)
     if two_arms:
         other[:, :3, 3] = found[1]
     places = found[-1][:, None] if free else places
@@ -187,57 +188,29 @@ def _of_centres(equations: Equations) -> Rotations:
     """
     eye = np.eye(3)[None, None]
     mounts, centres, normals = equations.mounts, equations.centres, equations.normals
-    carried = _carried(mounts, np.nan_to_num(equations.places))
+    there = each_applied(mounts, np.nan_to_num(equations.places))
     if equations.bases is None and equations.knows_place:
         here = np.nan_to_num(centres - np.nanmean(centres, axis=1, keepdims=True))
         # A normal turns the camera as much as two centres that are this far apart [m]: they decide
         # where the centres lie on a line, and do no harm elsewhere where they are all wrong
         axes = mounts[..., :3, 2].swapaxes(-1, -2) @ np.nan_to_num(normals)
-        x = nearest_rotation(carried.swapaxes(-1, -2) @ here + 1e-3**2 * axes)
+        x = nearest_rotation(there.swapaxes(-1, -2) @ here + 1e-3**2 * axes)
         y = np.broadcast_to(eye[0], x.shape)
     elif equations.bases is None:
         right = np.where(np.isfinite(centres), mounts[..., :3, 3], np.nan)
-        found = _least_squares(([_entries(eye, centres), eye, -mounts[..., :3, :3]], right))
+        found = least_squares(([entries(eye, centres), eye, -mounts[..., :3, :3]], right))
         x = nearest_rotation(found[:, :9].reshape(-1, 3, 3))
         y = np.broadcast_to(eye[0], x.shape)
     else:
         turns, shifts = equations.bases[..., :3, :3], equations.bases[..., :3, 3]
-        found = _least_squares(
+        found = least_squares(
             *(
                 (
-                    [_entries(eye, seen), one * eye, -_entries(turns, there), -one * turns],
+                    [entries(eye, seen), one * eye, -entries(turns, at), -one * turns],
                     np.where(np.isfinite(seen), one * shifts, np.nan),
                 )
-                for seen, there, one in ((centres, carried, 1), (normals, mounts[..., :3, 2], 0))
+                for seen, at, one in ((centres, there, 1), (normals, mounts[..., :3, 2], 0))
             )
         )
         x, y = (nearest_rotation(found[:, at : at + 9].reshape(-1, 3, 3)) for at in (0, 12))
     return x, y, np.broadcast_to(eye[0], x.shape)
-
-
-def _carried(poses: Floats, points: Floats) -> Floats:
-    """Return points (..., 3) where poses (..., 4, 4) carry them."""
-    return np.asarray((poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3])
-
-
-def _entries(before: Floats, points: Floats) -> Floats:
-    """Return the rows (K, N, 3, 9) by which the entries of R move points: ``before R point``."""
-    rows = before[..., None] * np.nan_to_num(points)[..., None, None, :]
-    return np.asarray(rows.reshape(*rows.shape[:-2], 9))
-
-
-def _least_squares(*systems: tuple[list[Floats], Floats]) -> Floats:
-    """Return what solves equations: blocks (K, N, 3, .) of their rows, and right sides (K, N, 3).
-
-    Where the right side is NaN there is no equation.
-    """
-    leads = [each.shape[:2] for parts, right in systems for each in (*parts, right)]
-    k, n = np.broadcast_shapes(*leads)
-    rows, sides = [], []
-    for parts, right in systems:
-        wide = [np.broadcast_to(each, (k, n, *each.shape[2:])) for each in parts]
-        known = np.broadcast_to(np.isfinite(right), (k, n, 3))
-        rows.append((np.concatenate(wide, axis=-1) * known[..., None]).reshape(k, 3 * n, -1))
-        sides.append(np.broadcast_to(np.nan_to_num(right), (k, n, 3)).reshape(k, 3 * n, 1))
-    solved = np.linalg.pinv(np.concatenate(rows, axis=1), rcond=1e-8)
-    return np.asarray((solved @ np.concatenate(sides, axis=1))[..., 0])

@@ -25,7 +25,7 @@ import numpy as np
 
 from flangeye.estimation.readings import Pairs, estimated
 from flangeye.types import Floats, Indices, Mask
-from flangeye.types.geometry import hat, rotation_exp, rotation_log
+from flangeye.types.geometry import each_applied, hat, rotation_exp, rotation_log
 from flangeye.workflow.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession
 from flangeye_plugins.check.equations import Equations, VariantUnknowns, equations_of, start_of
 
@@ -121,7 +121,7 @@ def _blocks(equations: Equations, unknowns: VariantUnknowns) -> list[ErrorBlock]
 def _centre_block(equations: Equations, unknowns: VariantUnknowns, mounts: Floats) -> ErrorBlock:
     # r = R c + t - M p. A small left rotation phi adds phi x (R c) = -hat(R c) phi.
     turned = equations.centres @ unknowns.rotation.swapaxes(-1, -2)
-    expected = (mounts[..., :3, :3] @ unknowns.place[..., None])[..., 0] + mounts[..., :3, 3]
+    expected = each_applied(mounts, unknowns.place)
     residuals = turned + unknowns.position[:, None] - expected
     parts = [-hat(turned), np.broadcast_to(np.eye(3), (*turned.shape, 3))]
     if unknowns.free_place:

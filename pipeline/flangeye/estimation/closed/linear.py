@@ -1,0 +1,30 @@
+"""Equations that are linear in a rotation's entries and in shifts, of K problems at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flangeye.types import Floats
+
+
+def entries(before: Floats, points: Floats) -> Floats:
+    """Return the rows (K, N, 3, 9) by which the entries of R move points: ``before R point``."""
+    rows = before[..., None] * np.nan_to_num(points)[..., None, None, :]
+    return np.asarray(rows.reshape(*rows.shape[:-2], 9))
+
+
+def least_squares(*systems: tuple[list[Floats], Floats]) -> Floats:
+    """Return what solves equations: blocks (K, N, 3, .) of their rows, and right sides (K, N, 3).
+
+    Where the right side is NaN there is no equation.
+    """
+    leads = [each.shape[:2] for parts, right in systems for each in (*parts, right)]
+    k, n = np.broadcast_shapes(*leads)
+    rows, sides = [], []
+    for parts, right in systems:
+        wide = [np.broadcast_to(each, (k, n, *each.shape[2:])) for each in parts]
+        known = np.broadcast_to(np.isfinite(right), (k, n, 3))
+        rows.append((np.concatenate(wide, axis=-1) * known[..., None]).reshape(k, 3 * n, -1))
+        sides.append(np.broadcast_to(np.nan_to_num(right), (k, n, 3)).reshape(k, 3 * n, 1))
+    solved = np.linalg.pinv(np.concatenate(rows, axis=1), rcond=1e-8)
+    return np.asarray((solved @ np.concatenate(sides, axis=1))[..., 0])
