@@ -475,8 +475,9 @@ def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
     return out
 
 
+@lru_cache(maxsize=2)
 def _held_out_medians(session: RecordedSession) -> Floats:
-    """Return the medians (B,) of held-out errors; positions relative to the samples' spread."""
+    """Return the medians (B,) of held-out errors, positions over the samples' spread; cached."""
     errors = held_out_errors(equations_of(session), ~session.seen)
     middle = np.nanmedian(errors, axis=0)
     middle[0] /= max(_spread(session), 1e-12)
