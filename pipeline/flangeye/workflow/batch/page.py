@@ -17,6 +17,7 @@ from flangeye.workflow.batch.dataset import Row
 from flangeye.workflow.batch.progress import Tally
 from flangeye.workflow.report.look import templates
 from flangeye.workflow.report.page import packed_plotly
+from flangeye.workflow.report.plot import layout2d
 from flangeye.workflow.report.units import degrees, duration, millimetres
 
 _HEADINGS: Mapping[str, str] = {
@@ -209,16 +210,12 @@ def _drawing(rows: Sequence[Row], figure: Figure, x: str, colour: str | None) ->
 
 
 def _layout(x: str, names: bool, y: str, colour: str | None) -> Drawing:
-    return {
-        "xaxis": {"title": {"text": x}} | ({"type": "category"} if names else {}),
-        "yaxis": {"title": {"text": y}, "rangemode": "tozero"},
-        "margin": {"l": 55, "r": 10, "t": 10, "b": 50},
-        "showlegend": colour is not None,
-        "legend": {
-            "orientation": "h", "yanchor": "bottom", "y": 1.02, "x": 0,
-            "title": {"text": _short(colour or ""), "side": "top"},
-        },
-    }  # fmt: skip
+    layout = layout2d(x, y)
+    layout["xaxis"] |= {"type": "category"} if names else {}
+    layout["yaxis"]["rangemode"] = "tozero"
+    layout["showlegend"] = colour is not None
+    layout["legend"]["title"] = {"text": _short(colour or ""), "side": "top"}
+    return layout
 
 
 def _points(x: Sequence[Any], y: Sequence[float], names: Sequence[str], unit: str) -> Drawing:
