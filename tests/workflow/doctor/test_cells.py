@@ -18,7 +18,7 @@ from flangeye.cli import commands
 from flangeye.files.paths import bundled
 from flangeye.plugin.registry import load_registry
 from flangeye.types.geometry import invert, rigid, rotation_exp
-from flangeye.workflow.doctor.cells import CellSession, examine_cell, open_cell
+from flangeye.workflow.doctor import opening
 from flangeye.workflow.doctor.diagnosis import Finding
 from flangeye.workflow.recipe.load import load_recipe
 
@@ -47,14 +47,9 @@ def tables(name: str, seed: int = 0) -> Path:
     return out
 
 
-def opened(folder: Path) -> CellSession:
-    session = open_cell(folder, REGISTRY, load_recipe(folder / "recipe.yaml", REGISTRY))
-    assert session is not None
-    return session
-
-
 def examined(folder: Path) -> Sequence[Finding]:
-    return examine_cell(opened(folder)).findings
+    recipe = load_recipe(folder / "recipe.yaml", REGISTRY)
+    return opening.examined(folder, REGISTRY, recipe).findings
 
 
 def pasted(folder: Path, finding: Finding) -> None:
