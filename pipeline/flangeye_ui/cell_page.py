@@ -30,7 +30,7 @@ WORDS = {
     "segment.flange": "Find the flange", "fit.rim": "Measure its rim",
     "solve.robust": "Find where the scanner stands", "verify.holdout": "Check on poses held out",
 }  # fmt: skip
-"""What people say for the steps that most recipes have; others show their summary."""
+"""Plain names of the most common steps; others show their summary."""
 
 
 def add(project: Project) -> None:

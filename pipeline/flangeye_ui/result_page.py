@@ -41,7 +41,7 @@ ASKED = {
     "position": ("The flange by the pendant, the tip on the point", "412 mm, -35 mm, 180 mm"),
     "rpy": ("Its roll, pitch, yaw", "180 deg, 0 deg, 30 deg"),
 }
-"""What a person gives, by the step's own names: what it is called, and an example."""
+"""Label and example of each parameter that a person fills in, by the step's names."""
 
 
 class TouchBox:

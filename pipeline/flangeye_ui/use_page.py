@@ -28,7 +28,7 @@ ASKED = {
     "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
     "place": "Where it was done", "operator": "Who did it",
 }  # fmt: skip
-"""What only a person knows of the place: option of the command, and what it is called."""
+"""Options of the command that a person must fill in, and their labels."""
 
 
 def add(project: Project) -> None:

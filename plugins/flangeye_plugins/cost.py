@@ -19,7 +19,7 @@ class TranslationParams(Params):
     """Parameters of ``cost.translation``."""
 
     at: Place = "work"
-    """Where the translation is taken: at the work, or at the camera's origin as in the paper."""
+    """Point whose translation counts: the work, or the camera's origin as in the paper."""
 
 
 class AxesParams(TranslationParams):

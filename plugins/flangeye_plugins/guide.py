@@ -34,7 +34,7 @@ EACH = 5
 """Readings at each place with the tip held."""
 
 STROKE = 2e-3
-"""How far the robot moves, to both sides and down [m]."""
+"""Distance that the robot moves to both sides and down [m]."""
 
 
 ATTITUDES = (

@@ -166,7 +166,7 @@ def _weld(result: Result) -> list[str]:
         return []
     lines = [f"  weld               {weld.mode}, {weld.seconds:.1f} s"]
     if weld.correction_rms is not None:
-        lines.append(f"  off the plan (felt){_mm(weld.correction_rms)} rms")
+        lines.append(f"  seam off the plan  {_mm(weld.correction_rms)} rms")
     if weld.truth:
         lines.append(
             f"  torch off the seam {_mm(weld.truth.rms)} rms, {_mm(weld.truth.max)} at most"

@@ -31,7 +31,7 @@ NAMED = 0.1
 
 Motion = TypeVar("Motion")
 Move = tuple[str, tuple[float, ...]]
-"""What is moved, and its unit twist in its parent: a turn or a shift."""
+"""Name of a moving frame, and its unit twist in its parent: a rotation or translation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ CONFIGURED = (
     "that the recipe's configuration is the cell's (write place: unknown if the target's mounting "
     "was not measured)"
 )
-"""What to look at, where poses agree with no one answer."""
+"""Advice if no single answer fits the poses."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ class ArcTimes(Described):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     gas_before: Duration = param("0.5 s", ge=0, le=10)
-    """Gas flows before the arc."""
+    """Time for which gas flows before the arc is struck."""
     ignition: Duration = param("0.5 s", ge=0, le=5)
     """The torch stands while the arc is struck; an arc that is watched and not established after
     this stops the weld."""

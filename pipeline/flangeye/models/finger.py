@@ -73,13 +73,13 @@ class FingerGeometry(Model):
     tip: tuple[Length, Length, Length]
     """Undeformed, in the flange's frame."""
     direction: Angle = param("0 deg")
-    """From the flange's x to the direction from the torch to the tip."""
+    """Angle from the flange's x to the direction from the torch to the tip."""
     torch: Length = param(gt=0)
-    """How far the torch is behind the tip (||d||)."""
+    """Distance of the torch behind the tip (||d||)."""
     torch_aside: Length = param("0 mm")
-    """How far the torch is left of the tool's x."""
+    """Distance of the torch to the left of the tool's x."""
     torch_up: Length = param("0 mm")
-    """How far the torch's end is above the tip."""
+    """Height of the torch's end above the tip."""
     radius: Length = param(gt=0)
     """Radius of the tip's ball."""
     source: str
@@ -108,7 +108,7 @@ class Finger(FingerGeometry):
     tip_sigma: Length = param("0.1 mm", ge=0)
     """Standard deviation of the tip, along each axis of the flange."""
     travel: Length = param("6 mm", gt=0)
-    """How far the tip may be displaced."""
+    """Largest displacement of the tip."""
     largest_force: Force = param("10 N", gt=0)
     """Largest force the tip may press with."""
     calibration: Calibration | None = None

@@ -51,7 +51,7 @@ class FlangeDetails(Model):
     thickness: Length = param("6 mm")
     """Height of the plate above the wrist."""
     pin_angle: Angle | None = param(None)
-    """Where the pin hole is, about the flange's z; without it no flange roll."""
+    """Angle of the pin hole about the flange's z; without it the flange's roll is unknown."""
     wrist: Length = param("75 mm")
     """Diameter of the wrist's housing behind the plate."""
     wrist_length: Length = param("40 mm")
@@ -62,7 +62,7 @@ class FlangeDetails(Model):
     """Depth of the threaded holes and the pin hole."""
     recesses: tuple[Recess, ...] = ()
     finish: Finish = "metal"
-    """What the face is made of, as a scanner sees it."""
+    """Surface of the face, as a scanner sees it."""
     source: str = ""
 
 

@@ -45,7 +45,7 @@ ACCELERATION = 2.0
 """Joint acceleration of the kit's moves [rad/s^2]."""
 
 TESTED_TURN = 0.1
-"""How far the last joint is turned [rad]."""
+"""Angle by which the last joint is turned [rad]."""
 
 RESTS = 0.5
 """Longest time from the last look at a moving arm until it rests [s]."""

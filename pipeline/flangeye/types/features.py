@@ -108,7 +108,7 @@ class PoseFeature:
 
 
 Feature = CircleFeature | PoseFeature
-"""What a ``fit`` stage measures of a target, in ``camera``."""
+"""Measurement of a target by a ``fit`` stage, in ``camera``."""
 
 
 @dataclass(frozen=True, eq=False)

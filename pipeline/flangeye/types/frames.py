@@ -150,7 +150,7 @@ class Transform:
 
 
 Poses = Mapping[str, Transform]
-"""What the controllers reported, by the frame that each pose places: flange, flange2, rail, …"""
+"""Poses that the controllers reported, by the frame that each places: flange, rail, …"""
 
 
 def by_frame(*transforms: Transform | None) -> Poses:

@@ -20,7 +20,7 @@ class SimulatedProfilerParams(Params):
     """Parameters of ``profiler.simulated``."""
 
     behind: Length = param("30 mm", gt=0, le=0.2)
-    """How far behind the torch it looks."""
+    """Distance behind the torch at which it measures."""
 
 
 class SimulatedProfiler(Device):

@@ -106,7 +106,7 @@ class FlangePoseParams(ColumnsParams):
     """Columns of an arm's flange pose, as its controller reports it."""
 
     pose: Literal["base_T_flange", "flange_T_base"] = "base_T_flange"
-    """Whose pose it is: the flange's in the base, as controllers show, or inverse."""
+    """Pose that the columns hold: the flange in the base, as controllers show, or its inverse."""
 
 
 class SeenPoseParams(ColumnsParams):

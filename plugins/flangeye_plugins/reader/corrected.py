@@ -87,9 +87,9 @@ class CorrectedParams(Params):
     arms: Arms = "both"
     """Arm whose poses are corrected if there are two; 'both' with one arm."""
     robot: PoseMistake = Field(default_factory=PoseMistake)
-    """What was wrong with the robot's poses."""
+    """Mistake in the robot's poses."""
     target: PoseMistake = Field(default_factory=PoseMistake)
-    """What was wrong with ready-made markers and centres."""
+    """Mistake in ready-made markers and centres."""
     exchanged: bool = False
     """The robot's and the markers' poses were exchanged."""
     offset: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))

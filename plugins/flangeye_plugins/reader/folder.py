@@ -55,7 +55,7 @@ _VECTOR = ("rx_rad", "ry_rad", "rz_rad")
 _OTHERS = ("cloud", "image", "id", "role", "time_ns")
 
 SECOND = "second_"
-"""What the columns of a second arm's pose begin with."""
+"""Prefix of the columns of a second arm's pose."""
 
 _JOINT = re.compile(r"j[1-9]\d?_rad")
 

@@ -60,7 +60,7 @@ __all__ = [
 
 
 _COMMENT = re.compile(r"(?<!\s)\s*(?:[#%]|//)[#%/ ]*")
-"""What a line of comment begins with."""
+"""Mark at the beginning of a comment line."""
 
 
 def program_rows(file: Path, text: str) -> Rows | None:

@@ -36,13 +36,13 @@ PREFIX = "flangeye-batch-"
 
 
 CONNECT_SECONDS = 5.0
-"""How long to wait for a scheduler that was given by address."""
+"""Longest wait for a scheduler that was given by address."""
 
 AHEAD = 3
 """Chunks that the scheduler is to know of for each worker."""
 
 CHUNK_SECONDS, MOST = 5.0, 500
-"""How long a worker is to be busy with a chunk [s], and how many sessions it has at most."""
+"""Target duration of a chunk [s], and its largest number of sessions."""
 
 
 _LOGS = {"distributed.admin.low-level-log-length": 8}

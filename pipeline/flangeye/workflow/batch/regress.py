@@ -172,7 +172,7 @@ class Expected(Model):
     closure: Length | None = None
     """Median held-out error."""
     tolerance: Length | None = None
-    """How far the closure may be from that."""
+    """Tolerance of the closure."""
     findings: tuple[str, ...] | None = None
     """Names of what flangeye doctor finds, in any order. Default: not compared."""
 
@@ -192,7 +192,7 @@ class Manifest(Model):
     """As --set: fit.rim.inlier=0.2 mm."""
     expected: Expected
     source: str
-    """Where others find the recording."""
+    """Address at which others find the recording."""
     licence: str
     """Under which licence, or that none is stated."""
 

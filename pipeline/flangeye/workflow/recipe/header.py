@@ -120,7 +120,7 @@ class RobotSection(NamedSection):
     driver: Annotated[BoundPart, Choose("robot")] | None = None
     """How to reach the real arm, for example {ur_rtde: {host: 192.168.1.10}}."""
     limits: LimitsSection | None = None
-    """What the arm must keep to."""
+    """Motion limits of the arm."""
 
     @model_validator(mode="after")
     def _names_something(self) -> RobotSection:
@@ -149,7 +149,7 @@ class ScannerSection(NamedSection):
     model: str | None = None
     """A model that 'flangeye scanners' lists, or a .yaml file of your own."""
     name: str | None = None
-    """What to call a scanner that has no model."""
+    """Name of a scanner without a model."""
     range: tuple[Length, Length] | None = None
     """Nearest and farthest it sees; archives in another unit are noticed."""
     driver: Annotated[BoundPart, Choose("scanner")] | None = None
@@ -197,8 +197,8 @@ class TargetSection(NamedSection):
     """A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), a bundled body, or robot: the arm's
     own links at its joint angles, by its URDF's meshes."""
     links: dict[int, str] = Field({})
-    """robot: meshes in metres, by the number of the joint whose frame each is drawn in, the base's
-    0; those of the URDF if not given."""
+    """robot: meshes in metres, by the number of the joint in whose frame each is drawn (0: the
+    base); default: those of the URDF."""
     unit: LengthUnit | None = None
     """Unit of the mesh's coordinates; found from its size if not given."""
     at: Literal["flange", "base", "unknown"] = "flange"
@@ -229,7 +229,7 @@ class MountedSection(RecipeSection):
     """Where something of a cell is mounted, by default at a known place."""
 
     on: str = "base"
-    """What it is mounted on: base, or an arm, a rail or a positioner of the cell by name."""
+    """Frame that it is mounted on: base, or an arm, rail or positioner of the cell by name."""
     place: Place = "known"
     """Where its base is on that: known (at its origin), unknown (to be found), or position and
     rpy."""
@@ -293,7 +293,7 @@ class WorkspaceSection(BoxSection):
 
 
 class LogSection(RecipeSection):
-    """What run.mcap holds besides the results."""
+    """Data that run.mcap contains besides the results."""
 
     clouds: Literal["preview", "full"] = "preview"
     """Raw scans: thinned for viewing, or whole, to segment again later."""

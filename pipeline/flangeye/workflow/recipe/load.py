@@ -29,7 +29,7 @@ from flangeye.workflow.recipe.own_models import carried_files, sections, written
 from flangeye.workflow.recipe.steps import SECTIONS, Step, StepOrder
 
 PLACEHOLDERS: Mapping[Hashable, Any] = {"title": "untitled", "steps": ["none"]}
-"""What stands for sections that a recipe must have, where they are wrong."""
+"""Placeholders for required sections of a recipe that are missing or wrong."""
 
 
 @dataclass(frozen=True)

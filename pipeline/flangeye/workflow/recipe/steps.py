@@ -22,7 +22,7 @@ Complain = Callable[[Sequence[Hashable], str], None]
 
 
 class Given(NamedTuple):
-    """Where in a recipe's header something comes from.
+    """Section of a recipe's header that provides a value.
 
     Attributes:
         what: Noun for it, as messages use it.
@@ -89,7 +89,7 @@ SECTIONS: Mapping[Any, Given] = {
         "scanner: {model: phoxi-m, driver: {watched_folder: {path: …}}}",
     ),
 }
-"""What stages may ask for of a recipe's header."""
+"""Values of a recipe's header that stages may request."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ def _summary(facts: Facts, weld: WeldReport) -> str:
     result = facts.result.weld
     text = f"Followed in mode {weld.mode} for {weld.time[-1]:.1f} s."
     if result and result.correction_rms is not None:
-        text += f" The seam was felt {millimetres(result.correction_rms)} mm rms off the plan."
+        text += f" The seam was measured {millimetres(result.correction_rms)} mm rms off the plan."
     if result and result.truth:
         text += (
             f" The torch was {millimetres(result.truth.rms)} mm rms off the true seam, "

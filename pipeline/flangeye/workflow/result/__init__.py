@@ -164,7 +164,7 @@ def status_of(result: Result) -> str:
 
 
 SIMULATED = "SIMULATED: made by a simulator; no real cell was calibrated"
-"""What heads every file of a simulated calibration that others read."""
+"""First line of every exported file of a simulated calibration."""
 
 
 def _remarks(names: Sequence[str], result: Result) -> tuple[str, ...]:

@@ -216,7 +216,7 @@ class SeamResult(_Part):
     half_width: float | None = None
     """Half width of the groove at its shoulders [m]."""
     figures: dict[str, float]
-    """What the seam step reports."""
+    """Report of the seam step."""
     notes: list[str]
     truth: SeamTruthResult | None = None
 
@@ -308,7 +308,7 @@ class WarningResult(_Part):
     """A warning, and what to do about it."""
 
     text: str
-    """What is wrong, one line."""
+    """The mistake, in one line."""
     fix: str
     """A command, a line of the recipe, or what to do at the cell."""
 
@@ -362,11 +362,11 @@ class Result(_Part):
     simulated: bool = False
     """The captures are a simulator's: nothing real has been calibrated."""
     warnings: list[WarningResult] = Field(default_factory=list)
-    """What is to be done, and the line that does it."""
+    """Action to take, and the line that does it."""
     notes: list[str] = Field(default_factory=list)
     """Notes of the steps."""
     exports: dict[str, str] = Field(default_factory=dict)
-    """What export steps wrote: file name -> content."""
+    """Files written by export steps: name -> content."""
     timing: dict[str, StageTiming]
     provenance: Provenance
 

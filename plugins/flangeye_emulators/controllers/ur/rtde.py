@@ -47,7 +47,7 @@ INPUTS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(Registers.COUNT)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(Registers.COUNT)},
 }
-"""What a client may write: name and type."""
+"""Names and types of the inputs that a client may write."""
 
 DIGITAL_SHIFTS = {
     "standard_digital_output": 0,
@@ -143,7 +143,7 @@ OUTPUTS: dict[str, Output] = {
     **{f"output_int_register_{i}": _integer_output(i) for i in range(Registers.COUNT)},
     **{f"output_double_register_{i}": _double_output(i) for i in range(Registers.COUNT)},
 }
-"""What a client may read."""
+"""Outputs that a client may read."""
 # The arm goes exactly where it was told to.
 for _name in ("q", "qd", "TCP_pose", "TCP_speed"):
     OUTPUTS[f"target_{_name}"] = OUTPUTS[f"actual_{_name}"]

@@ -77,8 +77,8 @@ def test_a_history_comes_back_with_its_key_and_is_empty_before_its_first_check(
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
-        (finding(1, since=2), "its finding is another check's"),
-        (finding(0), "its finding is another check's"),
+        (finding(1, since=2), "its finding belongs to another check"),
+        (finding(0), "its finding belongs to another check"),
     ],
 )
 def test_a_finding_that_no_check_leaves_behind_is_refused(

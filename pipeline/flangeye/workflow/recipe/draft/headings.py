@@ -25,9 +25,9 @@ _TURNS: Mapping[str, str] = {
     "rotation": "r", "rot": "r", "r": "r", "euler": "r", "angle": "r", "winkel": "r", "theta": "r",
     "rvec": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
 }  # fmt: skip
-"""Names of rotations, and what the names of their columns begin with."""
+"""Names of rotations, and the prefixes of their columns' names."""
 _OPENCV = ("rvec", "tvec")
-"""What OpenCV calls the pose of what a camera sees."""
+"""OpenCV's names for the pose of an object in the camera."""
 _POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
 """Lengths of lists that are whole poses, and what their numbers are unless a name decides."""
 _JOINT = re.compile(

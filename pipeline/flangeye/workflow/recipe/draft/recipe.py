@@ -37,7 +37,7 @@ from flangeye.workflow.recipe.draft.survey import FolderSurvey, Questions, one_o
 from flangeye.workflow.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"
-"""What most small arms carry."""
+"""Flange plate of most small arms."""
 
 
 @dataclass(frozen=True)
