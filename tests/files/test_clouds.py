@@ -494,7 +494,7 @@ TABLES_OF_POINTS = {
         "Scanner ACME\nserial;123\nX [mm];Y [mm];Z [mm]\n" + lines_of(1e3 * p, "{};{};{}")),
     "spaced.xyz": lambda f, p: f.write_text("# X [mm] Y [mm] Z [mm]\n" + lines_of(1e3 * p)),
     "records_mm.npy": lambda f, p: np.save(
-        f, np.rec.fromarrays(1e3 * p.T, names="x_mm,y_mm,z_mm")),
+        f, np.rec.fromarrays(1e3 * p.T, dtype=[(f"{axis}_mm", "f8") for axis in "xyz"])),
     "unit.npz": lambda f, p: np.savez(f, xyz_mm=1e3 * p, K=np.eye(3), pose=np.eye(4)),
     "other.npz": lambda f, p: np.savez(f, pc=p, K=np.eye(3), pose=np.eye(4)),
     "axes_first.npz": lambda f, p: np.savez(f, points=p.T),
