@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from inspect import Parameter, Signature, signature
@@ -151,25 +152,54 @@ def _drafted(survey: FolderSurvey, out: Path, questions: Questions, registry: Re
     Raises:
         FlangeyeError: As :func:`draft_recipe`.
     """
-    from flangeye.workflow.recipe.draft import draft_recipe, rotation_seen
+    from flangeye.workflow.recipe.draft import draft_recipe
     from flangeye.workflow.recipe.draft.evidence import usual_rotations
 
-    given, likely = dict(questions.given), dict(questions.likely)
+    anew = replace(
+        questions, given=dict(questions.given), likely=dict(questions.likely), assumed=[]
+    )
+    unnamed = ("quaternion_xyzw", "quaternion_wxyz")
     try:
-        return draft_recipe(survey, out, questions, registry)
+        draft = draft_recipe(survey, out, questions, registry)
     except RecipeError:
-        if questions.open != "rotation":
+        found = None
+        if questions.open == "rotation":
+            found = _decided(usual_rotations(), survey, out, anew, registry)
+        if found is None:
             raise
-        drafts = {}
-        for name in usual_rotations():
-            tried = replace(questions, given=given | {"rotation": name}, likely={}, assumed=[])
-            drafts[name] = draft_recipe(survey, out, tried, registry)
-        seen = _seen(drafts["vector"], survey.folder, out, registry, 12)
-        if not seen or not (decided := rotation_seen(drafts, seen)):
-            raise
-        questions.given, questions.likely = given, likely | {"rotation": decided}
-        questions.assumed.clear()
-        return draft_recipe(survey, out, questions, registry)
+    else:
+        unsure = any(line.startswith("rotation convention") for line in questions.assumed)
+        if not unsure or "fit." not in draft.text or questions.given["rotation"] not in unnamed:
+            return draft
+        found = _decided(unnamed, survey, out, anew, registry)
+        if found is None:
+            return draft
+    questions.given, questions.likely = anew.given, anew.likely
+    questions.assumed[:] = anew.assumed
+    return found
+
+
+def _decided(
+    names: Sequence[str], survey: FolderSurvey, out: Path, questions: Questions, registry: Registry
+) -> Draft | None:
+    """Return a draft with the convention of rotations that scans show; None if they show none.
+
+    Raises:
+        FlangeyeError: As :func:`draft_recipe`.
+    """
+    from flangeye.workflow.recipe.draft import draft_recipe, rotation_seen
+
+    drafts = {}
+    for name in names:
+        given = questions.given | {"rotation": name}
+        tried = replace(questions, given=given, likely={}, assumed=[])
+        drafts[name] = draft_recipe(survey, out, tried, registry)
+    seen = _seen(drafts[names[0]], survey.folder, out, registry, 12)
+    decided = rotation_seen(drafts, seen) if seen else None
+    if decided is None:
+        return None
+    questions.likely["rotation"] = decided
+    return draft_recipe(survey, out, questions, registry)
 
 
 def _seen(

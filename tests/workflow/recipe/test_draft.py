@@ -331,18 +331,19 @@ def test_the_samples_poses_as_a_kuka_shows_them_are_the_samples(folder: Path) ->
     np.testing.assert_allclose(read_poses(folder), poses, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", ["xyz", "ZYX"])
-def test_scans_decide_what_three_angles_mean(folder: Path, order: str) -> None:
+@pytest.mark.parametrize("order", ["xyz", "ZYX", "quaternion_wxyz"])
+def test_scans_decide_what_numbers_of_a_rotation_mean(folder: Path, order: str) -> None:
     """The face turns in the scans as the arm does, in one convention only."""
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     init("--out", "of_sample.yaml")
     of_sample = load_recipe(folder.parent / "of_sample.yaml", load_registry()).steps[0].params
     poses = np.array([r.base_T_flange for r in of_sample.reader(folder).recordings])
     (folder / "poses.csv").unlink()
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_euler(order, degrees=True)
+    whole = Rotation.from_matrix(poses[:, :3, :3])
+    named = order.startswith("quaternion")
+    turns = whole.as_quat()[:, [3, 0, 1, 2]] if named else whole.as_euler(order, degrees=True)
     np.savetxt(folder / "pendant.txt", np.hstack([1e3 * poses[:, :3, 3], turns]), fmt="%.9g")
-    told = init()
-    assert f"columns 4, 5, 6 of pendant.txt: {order} (arm and target turn alike to 0." in told
+    assert f"of pendant.txt: {order} (arm and target turn alike to 0." in init()
     np.testing.assert_allclose(read_poses(folder), poses, atol=1e-6)
 
 
