@@ -226,7 +226,7 @@ class _Session:
         plan, found = self.stops.plan, len(self.stops.poses)
         note = f"simulated: {self.cell.robot.model} before {self.scanner.model}, {found} poses"
         if left := plan.wanted - found:
-            note += f"; {left} more were planned and are not possible"
+            note += f"; {left} more were planned but are not possible"
         truth = Truth(Transform(BASE, CAMERA, self.base_T_camera), unseen=self._unseen())
         return Source(fingerprint, (note,), Box(plan.centre, plan.size), truth, simulated=True)
 
