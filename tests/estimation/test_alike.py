@@ -102,6 +102,11 @@ def test_nothing_is_told_of_one_capture() -> None:
     assert told(session([np.eye(4)])) == [None]
 
 
+def test_where_the_place_is_to_be_found_the_only_capture_means_its_best_pose() -> None:
+    assert told(session([np.eye(4)]), None) == [0]
+    assert told([], None) == []
+
+
 def test_where_the_place_is_to_be_found_all_captures_mean_the_same_pose() -> None:
     """Whether it is the true one or the other is the same to the camera."""
     rng = np.random.default_rng(4)

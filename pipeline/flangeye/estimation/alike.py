@@ -79,6 +79,8 @@ def ambiguous(poses: Poses) -> Rejected:
 
 
 def _supported(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observation | None]:
+    if not held:
+        return []
     each = [*held, *([o] for o in sure if isinstance(o.feature, type(held[0][0].feature)))]
     every = [pose for poses in each for pose in poses]
     ends = {end for pose in every for end in (pose.camera, pose.target)}
