@@ -490,6 +490,8 @@ TABLES_OF_POINTS = {
     "long.csv": lambda f, p: f.write_text(
         "x (millimeters),y (millimeters),z (millimeters)\n" + lines_of(1e3 * p, "{},{},{}")),
     "below.csv": lambda f, p: f.write_text("X,Y,Z\nmm,mm,mm\n" + lines_of(1e3 * p, "{},{},{}")),
+    "quoted.csv": lambda f, p: f.write_text(
+        '"X";"Y";"Z"\n' + lines_of(p, '"{}";"{}";"{}"').replace(".", ",")),
     "preamble.csv": lambda f, p: f.write_text(
         "Scanner ACME\nserial;123\nX [mm];Y [mm];Z [mm]\n" + lines_of(1e3 * p, "{};{};{}")),
     "spaced.xyz": lambda f, p: f.write_text("# X [mm] Y [mm] Z [mm]\n" + lines_of(1e3 * p)),

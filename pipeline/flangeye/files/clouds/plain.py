@@ -388,7 +388,7 @@ def _cells(line: str) -> tuple[list[str], str | None, bool]:
     delimiter = next((mark for mark in ";\t," if mark in row), None)
     comma = (delimiter != "," and "," in row) or (delimiter == "," and _has_decimal_commas(row))
     delimiter = None if comma and delimiter in (",", "\t") else delimiter
-    cells = [cell.strip() for cell in row.split(delimiter)]
+    cells = [cell.strip(' "') for cell in row.split(delimiter)]
     return [cell.replace(",", ".") for cell in cells] if comma else cells, delimiter, comma
 
 
@@ -408,7 +408,7 @@ def _axis(cell: str) -> tuple[str, str]:
     if len(known) < len(rest):  # ParaView's ``Points:0``
         by_word |= {"0": "x", "1": "y", "2": "z"}
     name = by_word.get(known[0]) if len(known) == 1 else None
-    others = re.sub(rf"[\s_]*[\[(]?({'|'.join(STATED)})[\])]?$", "", cell.lower().strip('"'))
+    others = re.sub(rf"[\s_]*[\[(]?({'|'.join(STATED)})[\])]?$", "", cell.lower())
     return name or others or cell.lower(), units[-1] if units else ""
 
 

@@ -223,7 +223,7 @@ class TextTable(PointTable):
         """Yield rows in NumPy's format: decimal points, and ``nan`` for an empty cell."""
         mark = self.delimiter
         for row in filter(is_row, text):
-            read = row.replace(",", ".") if self.comma else row
+            read = (row.replace(",", ".") if self.comma else row).replace('"', "")
             # Only rows with an empty cell are taken apart, which takes longer
             if mark and (mark * 2 in read or read[0] == mark or read.rstrip(" \r\n")[-1] == mark):
                 read = mark.join(cell.strip() or "nan" for cell in read.split(mark))
