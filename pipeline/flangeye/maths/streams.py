@@ -83,8 +83,8 @@ def passed(
     """Return the flange's motion about a moment ``at`` of the stream.
 
     Args:
-        times: Times of the stream.
-        poses: Poses of the stream.
+        times: (N,) times of the stream [s].
+        poses: (N, 4, 4) poses of the stream [m].
         at: The moment [s].
         others: Times and poses of other moving frames, by name.
     """

@@ -126,7 +126,7 @@ class PoseConvention:
         """Return the pose (4, 4) [m] of typed or pasted text; see :meth:`read_numbers`.
 
         Raises:
-            ValueError: As there, or as :meth:`matrix`.
+            ValueError: As :meth:`read_numbers`, or as :meth:`matrix`.
         """
         return self.matrix(self.read_numbers(text))
 

@@ -33,7 +33,7 @@ from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 VERSION = 1
 """Raised whenever the same parameters would give other captures or sessions."""
 UNSEEN = 60
-"""Poses that take no part and show what a calibration is worth, where the arm has errors."""
+"""Number of poses that are not used for calibration, at which the true error is measured."""
 UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
 """Joints of an arm at its first pose."""
 FACING = float(np.radians(50.0))

@@ -191,7 +191,7 @@ def _checks(plan: Plan, site: Site, count: int, rng: np.random.Generator) -> lis
 
 def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
     """Return joint angles of poses over the workspace that calibration does not use."""
-    # Largest roll, pitch and yaw of poses that show what a calibration is worth [rad]
+    # Largest roll, pitch and yaw of the poses at which the true error is measured [rad]
     spread = plan.size / 2, 0.3
     return [pose.joints for pose in poses_near(plan.centre, UNSEEN, site, rng, spread)]
 

@@ -185,11 +185,11 @@ class FeatureSection(RecipeSection):
     wrist_circle: Length | None = None
     """Diameter of the wrist's outer circle, for scanners too coarse for a rim."""
     sphere: SphereSection | None = None
-    """A calibration sphere on the flange, to be looked for in its place."""
+    """A calibration sphere on the flange, used as the target in place of the flange."""
 
 
 class TargetSection(NamedSection):
-    """A body of known shape on the flange that is looked for instead of the flange."""
+    """A body of known shape on the flange, used as the target in place of the flange."""
 
     word: ClassVar[str] = "body"
 

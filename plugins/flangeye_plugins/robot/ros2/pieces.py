@@ -30,14 +30,14 @@ STOPPING = 0.2
 second for the controller, an arm that nobody leads any more stands within half a second."""
 
 BEHIND = 0.2
-"""How far back the points of a piece begin [s]: longer than clocks may differ and messages take."""
+"""Time before now at which a piece's points begin [s]: more than clock error and message delay."""
 
 
 BRISK = 3.0
-"""Deceleration of a stop, where it takes less time [rad/s^2]."""
+"""Largest deceleration of a stop [rad/s^2]."""
 
 LAST = 0.03
-"""What is left of a motion when its last piece is published: about a renewal [s]."""
+"""Rest of a motion in its last piece [s]: about one renewal."""
 
 SAMPLE_TIME = 0.01
 """Interval between samples of a motion [s]."""

@@ -114,7 +114,7 @@ def _view(
 
 
 def _looking(eye: Floats, flange: Floats) -> Floats:
-    """Return axes (3, 3) with z from a place to the flange; about z they do not matter."""
+    """Return axes (3, 3) with z from a point to the flange; the rotation about z is arbitrary."""
     x, y, ahead = basis_of_plane(flange[:3, 3] - eye)
     return np.stack([x, y, ahead], axis=1)
 
