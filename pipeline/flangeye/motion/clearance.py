@@ -30,6 +30,7 @@ class ArmVolume:
         # Nearer links are joined where they meet
         far = np.abs(self.links[first] - self.links[second]) >= 3
         self._pairs = first[far], second[far]
+        # The last link carries the flange and lies behind its face
         self._before = self.links < len(robot.joints)
 
     def axes(self, frames: Floats) -> Floats:
@@ -53,6 +54,7 @@ class ArmVolume:
 
     def away(self, axes: Floats, segment: Floats, room: float) -> bool:
         """Return whether the arm keeps ``room`` [m] from a segment (2, 3)."""
+        # A capsule is all within its radius of its axis, so axes and radii suffice
         return bool((segment_distance(axes, segment) > self.radii + room).all())
 
     def hides(self, axes: Floats, sight: Floats) -> Mask:
@@ -129,6 +131,7 @@ class PlacedBody(NamedTuple):
             inverse = invert(self.frames[number])
             start = np.broadcast_to(each_applied(inverse[None], eye[None]), rays.shape)
             lines = np.hstack([start, rays @ inverse[:3, :3].T]).astype(np.float32)
+            # A ray's direction is not normalised: t_hit = 1 is the point itself
             met = scene.cast_rays(o3d.core.Tensor.from_numpy(lines), nthreads=1)["t_hit"].numpy()
             # A point's own surface is met at one, as exactly as single precision has it
             hidden |= met < 1 - 1e-3

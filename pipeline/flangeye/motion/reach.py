@@ -122,6 +122,7 @@ class Reach:
         best = max(score for score, *_ in found)
         start = self._start
         if start is None:
+            # The first of equals: rounding must not choose between mirrored postures
             chosen = next(each for each in found if each[0] >= best * (1 - 1e-9))
         else:
             # Share of the best manipulability that is good enough for a posture that is near
@@ -142,6 +143,8 @@ class Reach:
         if self._body is None:
             return usual
         eye, axis = base_T_camera[:3, 3], base_T_camera[:3, 2]
+        # Steps of 10 cm, the nearest to the working distance first: each costs an inverse
+        # kinematics per roll
         depths = np.arange(scanner.near, scanner.far, 0.1)
         places = eye + depths[np.argsort(np.abs(depths - axis @ (usual - eye)))][:, None] * axis
         for place in places:
@@ -202,6 +205,7 @@ class Reach:
         """Return the mask (N,) of points (N, 3) in the fields and range of camera and projector."""
         in_camera = (in_base - self._base_T_camera[:3, 3]) @ self._base_T_camera[:3, :3]
         scanner, depth = self._scanner, in_camera[:, 2]
+        # Camera and projector are each tilted towards the other by the convergence
         turn = rotation_from_rpy(0.0, -2 * scanner.convergence, 0.0)
         from_projector = (in_base - self._eyes[1]) @ self._base_T_camera[:3, :3] @ turn
         inside = _within(in_camera, scanner.field_of_view)
@@ -248,6 +252,7 @@ class Reach:
         """Take (K, n) angles by whole turns as near to home as the limits allow."""
         if self._start is None:
             return joints
+        # Inverse kinematics gives each angle once; a joint of two turns has it again 2 pi away
         nearer = joints + 2 * np.pi * np.round((self.home - joints) / (2 * np.pi))
         allowed = (nearer >= self.arm.lower) & (nearer <= self.arm.upper)
         return np.where(allowed, nearer, joints)
@@ -262,6 +267,7 @@ class Reach:
         if limits.beyond(joints, room):
             return "near the limits of the joints"
         # Lengths in units of the reach: singular values of metres and radians do not compare
+        # Rows 0 to 2 are rotations, 3 to 5 translations
         jacobian = self.arm.jacobian(joints)
         jacobian[3:] /= self._reach
         smallest = np.linalg.svd(jacobian, compute_uv=False)[-1]
@@ -293,6 +299,7 @@ def _sides() -> list[Floats]:
 
 def _turn(first: Floats, second: Floats) -> float:
     """Return the largest turn of a joint from one posture to another [rad]."""
+    # Rounded, so that equal postures are ordered alike on every processor
     return float(np.abs(first - second).max().round(6))
 
 

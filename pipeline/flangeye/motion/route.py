@@ -79,6 +79,7 @@ class Router:
         return straight
 
     def _leg(self, start: Floats, goal: Floats) -> Leg | Barred:
+        # Both ends, and enough between that no joint turns by more than LARGEST_TURN unchecked
         count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         frames = self._arm.frames(postures)
