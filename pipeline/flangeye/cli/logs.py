@@ -168,7 +168,7 @@ def watch(
         Path | None,
         typer.Argument(
             metavar="[RUN]",
-            help="A run's folder, with its newest check, or log; default the newest in ./runs.",
+            help="Folder of a run, or its log. Default: the newest in ./runs.",
         ),
     ] = None,
     foxglove: Annotated[
@@ -195,12 +195,12 @@ def doctor(
     ],
     recipe: Annotated[
         str | None,
-        typer.Option(help="Recipe to check it against: a file, or the name of a bundled one."),
+        typer.Option(help="Recipe that reads the recordings: a file, or a bundled one by name."),
     ] = None,
     overrides: Overrides = None,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")] = False,
 ) -> None:
-    """Find mistakes in recordings, and the line that mends each.
+    """Find mistakes in recordings and the line that corrects each.
 
     Exit codes: 0 nothing found, 1 something was, 2 the archive cannot be read.
     """

@@ -1,4 +1,4 @@
-"""``flangeye doctor``: find mistakes in recordings and the line that mends each."""
+"""``flangeye doctor``: find mistakes in recordings and the recipe line that corrects each."""
 
 from __future__ import annotations
 
