@@ -104,6 +104,7 @@ def rotation_between(first: Floats, second: Floats) -> Floats:
     """Return the (N, 3) shortest rotation vectors that take unit vectors (N, 3) to others."""
     cross = (hat(first) @ second[..., None])[..., 0]
     sine = np.linalg.norm(cross, axis=1, keepdims=True)
+    # Opposite vectors have no single axis: like equal ones they give zero, not half a turn
     angle = np.arctan2(sine, (first * second).sum(axis=1, keepdims=True))
     return np.asarray(cross * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0))
 
@@ -160,6 +161,7 @@ def rpy_from_rotation(rotation: Floats) -> Floats:
     each alone is arbitrary, the three still give R.
     """
     r = np.asarray(rotation, dtype=np.float64)
+    # Not an arc sine, which loses digits near 90 deg and fails where rounding exceeds one
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     yaw = np.arctan2(r[1, 0], r[0, 0])
     s, c = np.sin(yaw), np.cos(yaw)
@@ -187,6 +189,7 @@ def stack_rows(blocks: Floats) -> Floats:
 
 def angle_between(first: Floats, second: Floats) -> Floats:
     """Return the (...) angles of vectors (..., 3), exact for small ones too [rad]."""
+    # The arc cosine of the dot product would lose angles below 1e-8
     across = np.linalg.norm(np.cross(first, second), axis=-1)
     return np.asarray(np.arctan2(across, (first * second).sum(axis=-1)))
 
@@ -194,6 +197,7 @@ def angle_between(first: Floats, second: Floats) -> Floats:
 def invert(transforms: Floats) -> Floats:
     """Return the inverses of rigid (..., 4, 4) matrices."""
     out = np.zeros_like(transforms)
+    # The transpose: a general inverse would round the rotation out of orthonormality
     out[..., :3, :3] = np.swapaxes(transforms[..., :3, :3], -1, -2)
     out[..., :3, 3] = -(out[..., :3, :3] @ transforms[..., :3, 3, None])[..., 0]
     out[..., 3, 3] = 1.0
@@ -265,6 +269,7 @@ def covariance_at(covariance: Floats, about: Floats, points: Floats) -> Floats:
         about: (3,) reference point [m].
         points: (N, 3) in the parent frame [m].
     """
+    # To first order a mapped point p moves by phi x (p - about) + tau
     jacobian = levers(np.asarray(points) - about)
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
 
