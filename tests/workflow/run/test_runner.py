@@ -322,7 +322,7 @@ def test_a_refining_step_changes_the_calibration_that_is_verified(
     text = TOY_RECIPE.replace("  - verify.toy", "  - refine.toy\n  - verify.toy")
     result, log = execute(text)
     assert result.provenance.notes[-1] == "refined"
-    assert log.calibration("solve.toy").notes == ()
+    assert log.given("solve.toy").notes == ()
     assert log.calibration().notes == ("refined",)
     again, _ = execute(text, "verify.toy", log)
     assert without_timing(again) == without_timing(result)

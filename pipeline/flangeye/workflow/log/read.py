@@ -236,11 +236,8 @@ class RunLog:
             if capture.role == "verification"
         )
 
-    def calibration(self, stage: str | None = None) -> t.HandEye | None:
-        """Return the calibration of ``stage``, or the last one of any stage; None without one."""
-        if stage is not None:
-            found: t.HandEye | None = self.given(stage)
-            return found
+    def calibration(self) -> t.HandEye | None:
+        """Return the last calibration of any stage; None without one."""
         return self.last(t.HandEye)
 
     def given(self, stage: str) -> Any:
