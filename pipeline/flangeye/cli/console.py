@@ -96,7 +96,7 @@ def end_in_words(command: Callable[[], object]) -> None:
             # With less the libraries do not load: each fails, or never ends, in a way of its own
             require_memory("numerical libraries need it")
             command()
-        except (ImportError, SystemError) as error:
+        except (ImportError, RuntimeError, SystemError) as error:
             require_memory(f"{type(error).__name__}: {error}")  # as a library fails without it
             raise
         finally:

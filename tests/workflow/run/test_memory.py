@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from flangeye.cli import console
 from flangeye.files.processes import python_command, require_memory
 from flangeye.workflow.log.read import read_run
 
@@ -47,3 +48,50 @@ def test_a_command_without_room_for_its_libraries_says_so_in_one_line(megabytes:
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: not enough memory:")
+
+
+@pytest.mark.parametrize("megabytes", [430, 900])
+def test_a_batch_without_room_for_its_workers_says_so_in_one_line(
+    megabytes: int, tmp_path: Path
+) -> None:
+    def bounded() -> None:  # at 430 a worker once did not start, and was waited for
+        resource.setrlimit(resource.RLIMIT_AS, (megabytes * 1_000_000,) * 2)
+
+    words = ("batch", "ur5_phoxi-m_simulated", "--repeat", "2", "--workers", "1")
+    done = subprocess.run(
+        python_command("-m", "flangeye.cli", *words, "--out", str(tmp_path / "out")),
+        preexec_fn=bounded, capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("error: not enough memory: a batch's workers need it; fewer than")
+
+
+@pytest.mark.parametrize("plenty", [True, False])
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("libarrow.so: failed to map segment from shared object"),
+        RuntimeError("can't start new thread"),
+        SystemError("error return without exception set"),
+    ],
+)
+def test_what_a_library_says_without_memory_is_said_to_be_that(
+    error: Exception, plenty: bool, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    said: list[str] = []
+
+    def required(what: str, megabytes: int = 256) -> None:
+        said.append(what)
+        if len(said) > 1 and not plenty:
+            raise MemoryError(f"{what}; fewer than 256 MB are left")
+
+    def command() -> None:
+        raise error
+
+    monkeypatch.setattr(console, "require_memory", required)
+    with pytest.raises(type(error) if plenty else SystemExit):
+        console.end_in_words(command)
+    told = capsys.readouterr().err
+    expected = f"error: not enough memory: {type(error).__name__}: {error}; fewer than 256 MB are"
+    assert told == "" if plenty else told.startswith(expected)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.files.processes import keep_current_folder_out, python_command
+from flangeye.files.processes import keep_current_folder_out, python_command, require_memory
 from flangeye.workflow.batch.dataset import BLOCK
 from flangeye.workflow.batch.outcome import BatchError, SessionOutcome, Tls
 from flangeye.workflow.batch.plan import BatchSession
@@ -133,6 +133,10 @@ def local_client(workers: int) -> Iterator[Client]:
     from distributed import Client, LocalCluster, Security
 
     keep_current_folder_out()
+    # With less a worker does not start, or sessions crash in it; dask waits for one without an end
+    require_memory("a batch's workers need it", 768)
+    # Where a worker cannot start, the cluster ends before it is silenced
+    logging.getLogger("distributed.process").setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         files = {"temporary-directory": str(stack.enter_context(scratch()))}
         stack.enter_context(dask.config.set({**_LOCAL, **files}))
