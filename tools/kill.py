@@ -124,7 +124,7 @@ KINDS = {
     "live": Kind(("run", "ur5e_phoxi-m_loopback", "--move", *FEWER), _resumed),
     "weld": _recorded("ur10e_phoxi-m_weld_simulated", *SMALL),
     "batch": Kind(BATCH, lambda out: (*BATCH, "--out", str(out))),
-    "ui": Kind(("-c", SERVER, "ur5_phoxi-m_sample"), _of_page),
+    "ui": Kind(("-c", SERVER, "run", "ur5_phoxi-m_sample"), _of_page),
     "monitor": Kind(MONITOR, _checked_again, ".h.jsonl.lock"),
 }
 

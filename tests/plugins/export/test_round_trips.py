@@ -25,11 +25,15 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from flangeye import StageError
+from flangeye.maths.kinematics import Arm
+from flangeye.models.loading import load_model
 from flangeye.testing import ExportConformance
-from flangeye.types import BASE, CAMERA, FLANGE, CalibratedPose, Transform
+from flangeye.types import BASE, CAMERA, FLANGE, ArmCorrection, CalibratedPose, Transform
 from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.export import EXPORTS
+from flangeye_plugins.export.controllers import with_correction
 from flangeye_plugins.export.documents import UrdfParams
+from flangeye_plugins.export.writing import LengthParams, NumberedParams, fixed, rounded
 
 with warnings.catch_warnings():  # robodk warns of its own __init__
     warnings.simplefilter("ignore", PendingDeprecationWarning)
@@ -498,6 +502,47 @@ def test_a_hostile_name_is_refused(name: str, text: str) -> None:
 def test_a_word_of_the_controller_s_language_is_no_name(name: str, word: str) -> None:
     with pytest.raises(StageError, match="is a word of that language; choose another"):
         written(name, CalibratedPose(BENIGN), name=word)
+
+
+def test_numbers_have_nine_places_and_zero_has_no_sign() -> None:
+    assert rounded(1.23456789049) == 1.23456789
+    assert fixed([-1e-12, -0.0, 1e-9, 1234.5]) == [
+        "0.000000000", "0.000000000", "0.000000001", "1234.500000000"
+    ]  # fmt: skip
+
+
+def test_a_matrix_in_millimetres_is_one_still() -> None:
+    rows = LengthParams(length="mm").matrix(CalibratedPose(BENIGN))
+    assert rows[3] == [0.0, 0.0, 0.0, 1.0]
+    assert [row[3] for row in rows[:3]] == [100.0, 200.0, 300.0]
+    np.testing.assert_allclose(np.array(rows)[:3, :3], BENIGN.rotation, atol=1e-9)
+
+
+def test_a_number_of_a_controller_s_frame_is_1_or_from_0_to_999() -> None:
+    assert NumberedParams().number == 1
+    assert [NumberedParams(number=number).number for number in (0, 999)] == [0, 999]
+    for wrong in (-1, 1000):
+        with pytest.raises(ValueError, match="number"):
+            NumberedParams(number=wrong)
+
+
+def test_a_node_is_called_as_the_pose_and_in_a_cell_as_the_camera() -> None:
+    assert (
+        "name='left_static_transform'"
+        in written("ros2_launch", CalibratedPose(BENIGN), name="left").text
+    )
+    other = Transform(BASE, "camera_b", BENIGN.matrix)
+    assert "name='camera_b_static_transform'" in written("ros2_launch", CalibratedPose(other)).text
+
+
+@pytest.mark.parametrize("lengths", [False, True])
+def test_an_arm_with_other_zeros_stands_as_it_reports_less_these(lengths: bool) -> None:
+    robot, zeros = load_model("robots", "ur5e"), 0.01 * np.arange(1, 7)
+    longer = 1e-3 * np.arange(18).reshape(6, 3) if lengths else None
+    correction = ArmCorrection(np.zeros(3), joint_offsets=zeros, lengths=longer)
+    corrected, joints = Arm(with_correction(robot, correction)), np.array([0.1, -1, 1, -1, -1, 0.3])
+    arm = Arm(robot) if longer is None else Arm(robot).altered(longer)
+    np.testing.assert_allclose(corrected.flange(joints), arm.flange(joints + zeros), atol=1e-12)
 
 
 def test_each_format_is_explained_in_the_docs() -> None:
