@@ -537,8 +537,8 @@ def test_a_node_is_called_as_the_pose_and_in_a_cell_as_the_camera() -> None:
 
 @pytest.mark.parametrize("lengths", [False, True])
 def test_an_arm_with_other_zeros_stands_as_it_reports_less_these(lengths: bool) -> None:
-    robot, zeros = load_model("robots", "ur5e"), 0.01 * np.arange(1, 7)
-    longer = 1e-3 * np.arange(18).reshape(6, 3) if lengths else None
+    robot, zeros = load_model("robots", "ur5e"), 0.01 * np.arange(1.0, 7.0)
+    longer: Any = 1e-3 * np.arange(18.0).reshape(6, 3) if lengths else None
     correction = ArmCorrection(np.zeros(3), joint_offsets=zeros, lengths=longer)
     corrected, joints = Arm(with_correction(robot, correction)), np.array([0.1, -1, 1, -1, -1, 0.3])
     arm = Arm(robot) if longer is None else Arm(robot).altered(longer)
