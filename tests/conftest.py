@@ -104,7 +104,7 @@ def ancorasir() -> Path:
 
 
 def _registry_with(*modules: tuple[str, object]) -> Registry:
-    hooks = pluggy.PluginManager(hookspecs.NAME)
+    hooks = pluggy.PluginManager(hookspecs.PROJECT)
     hooks.add_hookspecs(hookspecs)
     made = Registry(hooks)
     for name, module in modules:

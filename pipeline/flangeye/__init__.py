@@ -34,7 +34,7 @@ __all__ = [
     "stage",
 ]
 
-_PLACES = {
+_MODULES = {
     **dict.fromkeys(["CalibrationRefused", "FlangeyeError", "RecipeError", "StageError"], "errors"),
     **dict.fromkeys(["BoundPart", "Choose", "Params", "part", "stage"], "plugin.stage"),
     "RecipePath": "files.paths",
@@ -45,6 +45,6 @@ _PLACES = {
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.import_module("flangeye.files.paths").VERSION
-    if name not in _PLACES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'flangeye' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"flangeye.{_PLACES[name]}"), name)
+    return getattr(importlib.import_module(f"flangeye.{_MODULES[name]}"), name)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.models.workspace import ENOUGH, Coverage
+from flangeye.models.workspace import LEAST_TURN, Coverage
 from flangeye.workflow.report.look import LIGHT
 
 
@@ -98,7 +98,7 @@ def _turn(found: Coverage, axis: int) -> str:
     parts = [f'<text x="{middle - 52}" y="{y + 4}">{"xyz"[axis]}</text>']
     for sign, size in zip((-1, 1), found.turns[axis], strict=True):
         length = min(float(np.degrees(size)), 30.0) * 40 / 30
-        colour = LIGHT["verified"] if size >= ENOUGH else LIGHT["refused"]
+        colour = LIGHT["verified"] if size >= LEAST_TURN else LIGHT["refused"]
         x = middle - length if sign < 0 else middle
         parts.append(
             f'<rect x="{x:.1f}" y="{y - 5}" width="{length:.1f}" height="10" fill="{colour}"/>'

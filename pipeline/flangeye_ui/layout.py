@@ -23,7 +23,7 @@ WAY = {
     "Use": ("/use", "Take the calibration to your system."),
 }
 """The way from an empty folder to an exported file: address, and what to do there."""
-BESIDE = {
+OTHER_PAGES = {
     "Watch": ("/watch", "See whether stored calibrations still hold."),
     "Archive": ("/archive", "Compare the sessions of this folder and look into their scans."),
 }
@@ -86,7 +86,7 @@ def page(project: Project, title: str) -> Iterator[ActionBar]:
     with ui.column().classes("w-full max-w-screen-xl mx-auto gap-3 page"):
         with ui.column().classes("gap-0"):
             ui.label(title).classes("title").props('role="heading" aria-level="1"')
-            ui.label({**WAY, **BESIDE}[title][1]).classes("what")
+            ui.label({**WAY, **OTHER_PAGES}[title][1]).classes("what")
         yield bar
 
 
@@ -101,7 +101,7 @@ def _header(project: Project, title: str) -> ui.label:
                     with ui.element("li"):
                         _way(name, name == title, f"{number}", name in done)
             with ui.element("ul").classes("beside"):
-                for name in BESIDE:
+                for name in OTHER_PAGES:
                     with ui.element("li"):
                         _way(name, name == title)
         simulated = ui.label(SIMULATED).classes("simulated").props('role="note"')
@@ -110,7 +110,7 @@ def _header(project: Project, title: str) -> ui.label:
 
 
 def _way(name: str, here: bool, number: str = "", done: bool = False) -> None:
-    link = ui.link(target={**WAY, **BESIDE}[name][0]).classes("done" if done else "")
+    link = ui.link(target={**WAY, **OTHER_PAGES}[name][0]).classes("done" if done else "")
     with link:
         if number:
             ui.label("✓" if done else number).classes("mark").props('aria-hidden="true"')

@@ -26,7 +26,7 @@ from flangeye.workflow.log.read import RunLog, logged_image, read_run, take
 from flangeye.workflow.log.records import LogMessage
 from flangeye.workflow.log.watch import RunView, follow
 from flangeye.workflow.recipe.load import Recipe
-from flangeye.workflow.run.folder import CHECKS, recipe_of_log
+from flangeye.workflow.run.folder import CHECKS_FOLDER, recipe_of_log
 from flangeye.workflow.run.outlook import Outlook, outlook
 
 
@@ -52,10 +52,10 @@ class RunProcess:
         self.checks = words[0] == "monitor"
         stamped = f"runs/{time.strftime('%Y-%m-%dT%H-%M-%S')}_ui"
         self.path = folder / (words[1] if self.checks else stamped)
-        self._before = set(self.path.glob(f"{CHECKS}/*"))
+        self._before = set(self.path.glob(f"{CHECKS_FOLDER}/*"))
         self.moves, self.stopped = move, ""
         # A check has a log of its own, below a folder that the command names.
-        self.log = RunLog(self.path / (f"{CHECKS}/run.mcap" if self.checks else "run.mcap"))
+        self.log = RunLog(self.path / (f"{CHECKS_FOLDER}/run.mcap" if self.checks else "run.mcap"))
         self.view = RunView(self.path.name)
         self.outlook: Outlook | None = None
         self.cloud: Floats = np.zeros((0, 3))
@@ -126,7 +126,7 @@ class RunProcess:
 
     def _begun(self) -> bool:
         """Return whether there is a log; the command itself names that of a check."""
-        for new in set(self.path.glob(f"{CHECKS}/*")) - self._before if self.checks else ():
+        for new in set(self.path.glob(f"{CHECKS_FOLDER}/*")) - self._before if self.checks else ():
             self.log.path = new / self.log.path.name
         return self.log.path.exists()
 

@@ -35,7 +35,7 @@ from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView, Scene3D, outline_of
 
-ASKED = {
+TOUCH_FIELDS = {
     "seen": ("A point in the camera, from a scan", "12 mm, -40 mm, 702 mm"),
     "tip": ("The tool's tip in the flange", "0 mm, 0 mm, 152 mm"),
     "position": ("The flange by the pendant, the tip on the point", "412 mm, -35 mm, 180 mm"),
@@ -58,7 +58,7 @@ class TouchBox:
         with ui.row().classes("w-full gap-x-4"):
             self._boxes = {
                 key: ui.input(label, placeholder=f"such as {example}").classes("col-12 col-md-5")
-                for key, (label, example) in ASKED.items()
+                for key, (label, example) in TOUCH_FIELDS.items()
             }
         for each in self._boxes.values():
             each.props("stack-label").on("change", self._look)
@@ -75,7 +75,7 @@ class TouchBox:
     def _look(self) -> None:
         """Show the consequences of the answers so far."""
         given = self._given()
-        examples = {key: example for key, (_, example) in ASKED.items()}
+        examples = {key: example for key, (_, example) in TOUCH_FIELDS.items()}
         # Those of them that ``flangeye touch`` takes: it reads the arm itself.
         points = {
             key: ", ".join(given[key]) if key in given else examples[key] for key in ("seen", "tip")
@@ -92,7 +92,7 @@ class TouchBox:
             self._said.text = str(error)
 
     def _answer(self, given: dict[str, list[str]]) -> str:
-        if len(given) == len(ASKED):
+        if len(given) == len(TOUCH_FIELDS):
             found = self._stage(self._calibration, params=self._params(given))
             self._keep.set_enabled(True)
             return str(found.reason)

@@ -128,7 +128,7 @@ def _capsule(radius: float, ends: Floats) -> Any:
     return body.apply_transform(place)
 
 
-AXES = 0.25
+BASE_AXES = 0.25
 """Length of the base's axes [m]."""
 Point = tuple[float, float, float]
 View = tuple[Point, Point, Point]
@@ -172,7 +172,7 @@ class Scene3D(ui.scene):
         self.props('role="img" aria-label="The cell in 3D"')
         with self:
             for axis, name in enumerate("xyz"):
-                tip = np.eye(3)[axis] * AXES
+                tip = np.eye(3)[axis] * BASE_AXES
                 self.line([0, 0, 0], tip.tolist()).material(SERIES[name])
                 self.text(name, f"color: {SERIES[name]}").move(*(1.12 * tip).tolist())
         self._stays = set(self.objects)
@@ -185,7 +185,7 @@ class Scene3D(ui.scene):
             for name in self._of:
                 button = ui.button(name, on_click=lambda name=name: self.look(name))
                 button.props("flat dense no-caps")
-            ui.label(f"{scale}axes: {1e3 * AXES:.0f} mm; drag to turn").classes("note")
+            ui.label(f"{scale}axes: {1e3 * BASE_AXES:.0f} mm; drag to turn").classes("note")
 
     def wipe(self) -> None:
         """Take everything away but the axes."""
@@ -296,7 +296,7 @@ def views_of(places: Floats) -> dict[str, View]:
     """Return views of a cell, each from where all of the places (N, 3) are in sight [m]."""
     low, high = places.min(axis=0), places.max(axis=0)
     middle = (low + high) / 2
-    away = max(float(np.linalg.norm(high - low)), AXES)
+    away = max(float(np.linalg.norm(high - low)), BASE_AXES)
     return {
         name: (_point(middle + away * np.array(towards)), _point(middle), (0.0, 0.0, 1.0))
         for name, towards in {

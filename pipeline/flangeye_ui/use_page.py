@@ -24,7 +24,7 @@ from flangeye_ui.layout import ActionBar, code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.result_page import chosen_run
 
-ASKED = {
+CERTIFICATE_FIELDS = {
     "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
     "place": "Where it was done", "operator": "Who did it",
 }  # fmt: skip
@@ -148,7 +148,9 @@ class CertificateForm:
     def __init__(self, project: Project, run: Path, facts: Facts, box: ui.expansion) -> None:
         self._project, self._run, self._facts = project, run, facts
         with ui.row().classes("w-full gap-4"):
-            self._boxes = {key: ui.input(label).classes("w-64") for key, label in ASKED.items()}
+            self._boxes = {
+                key: ui.input(label).classes("w-64") for key, label in CERTIFICATE_FIELDS.items()
+            }
         for each in self._boxes.values():
             each.on("change", self._preview)
         with ui.row().classes("items-center gap-4"):
@@ -192,7 +194,7 @@ def _number(key: str, text: str) -> float | None:
     try:
         return float(text) if text else None
     except ValueError:
-        raise ValueError(f"{ASKED[key]}: '{text}' is not a number") from None
+        raise ValueError(f"{CERTIFICATE_FIELDS[key]}: '{text}' is not a number") from None
 
 
 def exported(result: r.Result, exports: Sequence[Stage]) -> dict[str, ExportedFile]:

@@ -11,12 +11,12 @@ from nicegui import Client, ui
 from flangeye.errors import FlangeyeError
 from flangeye.files.regular import read_text
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.workflow.doctor.monitor.chart import COLOURS, sentence
+from flangeye.workflow.doctor.monitor.chart import STATE_COLOURS, sentence
 from flangeye.workflow.doctor.monitor.history import History, history_beside
 from flangeye.workflow.doctor.monitor.stored import stored_calibration
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.recipe.load import Recipe
-from flangeye.workflow.run.folder import CHECKS, recipe_of_log
+from flangeye.workflow.run.folder import CHECKS_FOLDER, recipe_of_log
 from flangeye_ui.archive_page import link
 from flangeye_ui.charts import residual_chart
 from flangeye_ui.layout import ActionBar, command_line, mistake, page
@@ -217,7 +217,7 @@ def other_seed(run: Path) -> list[str]:
     path = run / "recipe.resolved.yaml"
     match parse_yaml(read_text(path), str(path)).data:
         case {"scanner": {"driver": {"emulator": {"seed": int(seed)}}}}:
-            checks = len(list(run.glob(f"{CHECKS}/*")))
+            checks = len(list(run.glob(f"{CHECKS_FOLDER}/*")))
             return ["--set", f"scanner.driver.emulator.seed={seed + 1 + checks}"]
     return []
 
@@ -248,7 +248,7 @@ def _chart(history: History) -> dict[str, Any]:
     chart = residual_chart(shifts, {})
     names = chart["xAxis"]["data"] = list(shifts)
     bars = [
-        {"value": 1e3 * each.shift, "itemStyle": {"color": COLOURS[each.state]}}
+        {"value": 1e3 * each.shift, "itemStyle": {"color": STATE_COLOURS[each.state]}}
         for each in history.findings
     ]
     chart["series"] = [chart["series"][0] | {"name": "shift, mm", "data": bars[: len(names)]}]

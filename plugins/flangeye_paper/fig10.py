@@ -8,9 +8,9 @@ from typing import Any
 
 from flangeye_paper.fig9 import realised
 from flangeye_paper.tables import (
-    AXES,
+    AXIS_COLOURS,
     BOUND,
-    METHODS,
+    METHOD_LOOKS,
     PRINTED,
     Row,
     columns,
@@ -32,7 +32,7 @@ def fig10(batches: Path, out: Path) -> None:
     """
     rows = [
         {"method": method, "poses": int(session.number("steps.0.poses")), **realised(session)}
-        for method in METHODS
+        for method in METHOD_LOOKS
         for session in read_sessions(batches / f"fig10_{method}")
         if session.accepted
     ]
@@ -46,13 +46,14 @@ def _summary(rows: Sequence[Row], poses: int) -> dict[str, Any]:
     here = {r["method"]: r for r in rows if r["poses"] == poses}
     oracle = here["algorithm-1-oracle"]
     printed = {
-        f"{axis} {'mm' if len(axis) == 1 else 'deg'}": oracle[f"{axis}_std"] for axis in AXES
+        f"{axis} {'mm' if len(axis) == 1 else 'deg'}": oracle[f"{axis}_std"]
+        for axis in AXIS_COLOURS
     }
     at_work = {
-        f"workspace rms mm: {METHODS[method].label}": here[method]["workspace_rms"]
+        f"workspace rms mm: {METHOD_LOOKS[method].label}": here[method]["workspace_rms"]
         if method in here
         else None
-        for method in METHODS
+        for method in METHOD_LOOKS
     }
     return {"poses": poses, **printed, **at_work, "bound mm": oracle["workspace_bound"]}
 
@@ -61,11 +62,11 @@ def _draw(rows: Sequence[Row]) -> Any:
     page = sheet(1, 3, 10.5, 3.4)
     oracle = [r for r in rows if r["method"] == "algorithm-1-oracle"]
     for panel, axes, unit in (
-        (page.panels[0], [*AXES][:3], "mm"),
-        (page.panels[1], [*AXES][3:], "deg"),
+        (page.panels[0], [*AXIS_COLOURS][:3], "mm"),
+        (page.panels[1], [*AXIS_COLOURS][3:], "deg"),
     ):
         for axis in axes:
-            colour = AXES[axis]
+            colour = AXIS_COLOURS[axis]
             panel.plot(*columns(oracle, "poses", f"{axis}_std"), color=colour, label=axis)
         dress(panel, f"emulated as printed, in {unit}", "poses", f"standard deviation [{unit}]")
         panel.set_ylim(bottom=0)
@@ -82,7 +83,7 @@ def _draw(rows: Sequence[Row]) -> Any:
 
 
 def _at_work(panel: Any, rows: Sequence[Row]) -> None:
-    for method, look in METHODS.items():
+    for method, look in METHOD_LOOKS.items():
         mine = [r for r in rows if r["method"] == method]
         poses, rms = columns(mine, "poses", "workspace_rms")
         panel.plot(poses, rms, color=look.colour, label=look.label)

@@ -11,7 +11,16 @@ import numpy as np
 from flangeye.files.arrays import read_npz
 from flangeye.types import Floats
 from flangeye_paper.published import stored_file
-from flangeye_paper.tables import AXES, Row, columns, dress, legend, read_sessions, sheet, write_csv
+from flangeye_paper.tables import (
+    AXIS_COLOURS,
+    Row,
+    columns,
+    dress,
+    legend,
+    read_sessions,
+    sheet,
+    write_csv,
+)
 
 ROBOTS = {"aubo": "Aubo i5", "ur5": "UR5", "franka": "Franka"}
 
@@ -63,7 +72,10 @@ def rerun(batch: Path) -> Runs:
     scale = [1e3] * 3 + [float(np.degrees(1.0))] * 3
     errors = [
         [
-            [f.get(f"{axis}_{n:02d}", np.nan) * k for axis, k in zip(AXES, scale, strict=True)]
+            [
+                f.get(f"{axis}_{n:02d}", np.nan) * k
+                for axis, k in zip(AXIS_COLOURS, scale, strict=True)
+            ]
             for n in poses
         ]
         for f in found
@@ -78,8 +90,8 @@ def _rows(robot: str, source: str, runs: Runs) -> list[Row]:
             "robot": robot,
             "source": source,
             "poses": n,
-            **{f"{axis}_mean": float(means[k, i]) for i, axis in enumerate(AXES)},
-            **{f"{axis}_std": float(deviations[k, i]) for i, axis in enumerate(AXES)},
+            **{f"{axis}_mean": float(means[k, i]) for i, axis in enumerate(AXIS_COLOURS)},
+            **{f"{axis}_std": float(deviations[k, i]) for i, axis in enumerate(AXIS_COLOURS)},
         }
         for k, n in enumerate(runs.poses)
     ]
@@ -99,7 +111,7 @@ def _summary(robot: str, source: str, runs: Runs) -> Row:
         "worst mm": float(norms.max()),
         **{
             f"{axis} {'mm' if i < 3 else 'deg'}": f"{last[:, i].mean():+.2f} ± {deviations[i]:.2f}"
-            for i, axis in enumerate(AXES)
+            for i, axis in enumerate(AXIS_COLOURS)
         },
     }
 
@@ -107,7 +119,7 @@ def _summary(robot: str, source: str, runs: Runs) -> Row:
 def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
     page = sheet(2, 3, 10.5, 6.0)
     for column, robot in enumerate(ROBOTS):
-        for row, axes, unit in ((0, [*AXES][:3], "mm"), (1, [*AXES][3:], "deg")):
+        for row, axes, unit in ((0, [*AXIS_COLOURS][:3], "mm"), (1, [*AXIS_COLOURS][3:], "deg")):
             panel = page.panels[3 * row + column]
             _spread(panel, _rows(robot, "stored", runs[robot, "stored"]), axes, filled=True)
             if (robot, "run again") in runs:
@@ -128,7 +140,7 @@ def _spread(panel: Any, rows: Sequence[Row], axes: Sequence[str], filled: bool) 
         poses, mean, deviation = map(
             np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
         )
-        low, high, colour = mean - deviation, mean + deviation, AXES[axis]
+        low, high, colour = mean - deviation, mean + deviation, AXIS_COLOURS[axis]
         if filled:
             panel.plot(poses, mean, color=colour, linewidth=1.0, label=axis)
             panel.fill_between(poses, low, high, color=colour, alpha=0.2, lw=0)

@@ -10,10 +10,10 @@ import numpy as np
 
 from flangeye.maths.statistics import rms
 from flangeye_paper.tables import (
-    AXES,
+    AXIS_COLOURS,
     BOUND,
     GROWTH,
-    METHODS,
+    METHOD_LOOKS,
     PRINTED,
     Row,
     SessionRow,
@@ -37,11 +37,11 @@ def fig9(batches: Path, out: Path) -> None:
     rows = [
         {"method": method, "outliers": share, **realised(session)}
         for share, prefix in ((0.0, "fig9"), (0.15, "fig9-outliers"))
-        for method in METHODS
+        for method in METHOD_LOOKS
         for session in read_sessions(batches / f"{prefix}_{method}")
     ]
     write_csv(out / "fig9.csv", rows)
-    write_csv(out / "fig9_summary.csv", [_summary(rows, method) for method in METHODS])
+    write_csv(out / "fig9_summary.csv", [_summary(rows, method) for method in METHOD_LOOKS])
     write_csv(out / "fig9_pools.csv", [_pool(s) for s in read_sessions(batches / "fig9-pools")])
     _draw(rows).save(out / "fig9.png")
 
@@ -49,13 +49,13 @@ def fig9(batches: Path, out: Path) -> None:
 def realised(session: SessionRow) -> dict[str, Any]:
     """Return a session's figures in millimetres and degrees, as its row of the CSV."""
     found = session.figures("verify.realisations")
-    scale = {axis: 1e3 if len(axis) == 1 else np.degrees(1.0) for axis in AXES}
+    scale = {axis: 1e3 if len(axis) == 1 else np.degrees(1.0) for axis in AXIS_COLOURS}
     noise = session.row.get("steps.0.noise")
     return {
         "noise_mm": session.number("steps.0.noise") if noise else 1.0,
-        **{f"{axis}_std": found[f"{axis}_std"] * scale[axis] for axis in AXES},
-        **{f"{axis}_mean": found[f"{axis}_mean"] * scale[axis] for axis in AXES},
-        **{f"{axis}_bound": found[f"bound_{axis}"] * scale[axis] for axis in AXES},
+        **{f"{axis}_std": found[f"{axis}_std"] * scale[axis] for axis in AXIS_COLOURS},
+        **{f"{axis}_mean": found[f"{axis}_mean"] * scale[axis] for axis in AXIS_COLOURS},
+        **{f"{axis}_bound": found[f"bound_{axis}"] * scale[axis] for axis in AXIS_COLOURS},
         "centre_x_std": found["centre_x_std"] * 1e3,
         "centre_y_std": found["centre_y_std"] * 1e3,
         "workspace_rms": found["workspace_rms"] * 1e3,
@@ -74,8 +74,8 @@ def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
     alone = [r["workspace_rms"] / r["inliers_alone_rms"] for r in gross]
     at_one = [r["workspace_rms"] for r in gross if r["noise_mm"] == 1]
     return {
-        "method": METHODS[method].label,
-        **{f"{axis} {_unit(axis)}": _growth(clean, f"{axis}_std") for axis in AXES},
+        "method": METHOD_LOOKS[method].label,
+        **{f"{axis} {_unit(axis)}": _growth(clean, f"{axis}_std") for axis in AXIS_COLOURS},
         "x at work mm/mm": _growth(clean, "centre_x_std"),
         "workspace rms mm/mm": _growth(clean, "workspace_rms"),
         "times the bound": rms(over),
@@ -134,7 +134,7 @@ def _draw(rows: Sequence[Row]) -> Any:
 
 
 def _lines(panel: Any, rows: Sequence[Row], column: str, bound: str) -> None:
-    for method, look in METHODS.items():
+    for method, look in METHOD_LOOKS.items():
         panel.plot(*_of(rows, method, "noise_mm", column), color=look.colour, linewidth=1.4)
     panel.plot(*_of(rows, "all-data", "noise_mm", bound), "--", color=BOUND.colour, linewidth=1.0)
 
@@ -145,7 +145,7 @@ def _of(rows: Sequence[Row], method: str, *names: str) -> list[list[float]]:
 
 def _key(panel: Any) -> None:
     """Turn the last panel into the legend of all."""
-    for look in METHODS.values():
+    for look in METHOD_LOOKS.values():
         panel.plot([], [], color=look.colour, linewidth=2, label=look.label)
     panel.plot([], [], "--", color=BOUND.colour, label=BOUND.label)
     panel.set_axis_off()

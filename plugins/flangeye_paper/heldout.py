@@ -12,7 +12,7 @@ from flangeye import FlangeyeError
 from flangeye.maths.statistics import rms
 from flangeye_paper.published import stored_results
 from flangeye_paper.tables import (
-    METHODS,
+    METHOD_LOOKS,
     Look,
     Row,
     SessionRow,
@@ -27,9 +27,9 @@ from flangeye_paper.tables import (
 STAGE = "verify.holdout"
 
 HELD_OUT_METHODS: Mapping[str, Look] = {
-    "all-data": METHODS["all-data"],
-    "algorithm-1": METHODS["algorithm-1-held-out"],
-    "robust": METHODS["robust"],
+    "all-data": METHOD_LOOKS["all-data"],
+    "algorithm-1": METHOD_LOOKS["algorithm-1-held-out"],
+    "robust": METHOD_LOOKS["robust"],
     "robust-joints": Look("solve.robust with joint offsets", "#0e7490"),
 }
 

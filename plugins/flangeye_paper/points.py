@@ -44,7 +44,7 @@ BASE_T_CAMERA = np.array(
 WORKSPACE = Box(np.array([0.6, -0.0125, 0.3]), np.array([0.3, 0.3, 0.2]))
 """In ``base`` [m]."""
 
-POSES = 75
+POOL = 75
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +86,16 @@ def realise(rng: np.random.Generator, noise: float, outliers: float, poses: int)
     """
     tcps = rng.permutation(grid())
     tilt = 0.3  # largest roll, pitch and yaw of a pose [rad]
-    tilts = rng.uniform(-tilt, tilt, (POSES, 3))
+    tilts = rng.uniform(-tilt, tilt, (POOL, 3))
     # The flange looks up at the camera, its axis along the camera's -z.
     facing = BASE_T_CAMERA[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     rotations = np.array([rotation_from_rpy(*tilt) for tilt in tilts]) @ facing
     exact = (tcps - BASE_T_CAMERA[:3, 3]) @ BASE_T_CAMERA[:3, :3]
-    centres = exact + noise * rng.standard_normal((POSES, 3))
-    away = rng.standard_normal((POSES, 3))
+    centres = exact + noise * rng.standard_normal((POOL, 3))
+    away = rng.standard_normal((POOL, 3))
     # [m]: the three false segmentations of the published UR5 recording lie 82 to 84 mm off
-    away *= rng.uniform(0.05, 0.15, POSES)[:, None] / np.linalg.norm(away, axis=1, keepdims=True)
-    gross = np.zeros(POSES, dtype=bool)
+    away *= rng.uniform(0.05, 0.15, POOL)[:, None] / np.linalg.norm(away, axis=1, keepdims=True)
+    gross = np.zeros(POOL, dtype=bool)
     gross[rng.permutation(poses)[: round(outliers * poses)]] = True
     centres[gross] += away[gross]
     return Realisation(tcps[:poses], rotations[:poses], centres[:poses], gross[:poses])
@@ -145,7 +145,7 @@ class PointsParams(Params):
     """Standard deviation of each coordinate, equation (18)."""
     outliers: float = Field(0.0, ge=0, lt=1)
     """Share of centres 50 to 150 mm off."""
-    poses: int = Field(POSES, ge=3, le=POSES)
+    poses: int = Field(POOL, ge=3, le=POOL)
     """Number of the grid's poses to use."""
 
 
@@ -162,7 +162,7 @@ class PointSource(Source):
 
     noise: float = 0.0
     outliers: float = 0.0
-    poses: int = POSES
+    poses: int = POOL
     seed: int = 0
 
     def draw(self, index: int) -> Realisation:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flangeye_paper.tables import (
-    AXES,
+    AXIS_COLOURS,
     PRINTED,
     TABLE_1,
     Row,
@@ -53,8 +53,8 @@ def _stored_rows(setup: str, batch: Path) -> list[Row]:
     """Return the printed row, and what the authors' stored results imply."""
     found = read_sessions(batch)[0].figures(STORED)
     row = _row(setup, "implied by their stored results", _printed_units(found), found)
-    spread = _printed_units({axis: found[f"{axis}_std"] for axis in AXES})
-    disagree = max(spread[axis] for axis in [*AXES][:3])
+    spread = _printed_units({axis: found[f"{axis}_std"] for axis in AXIS_COLOURS})
+    disagree = max(spread[axis] for axis in [*AXIS_COLOURS][:3])
     return [
         _printed_row(setup, TABLE_1[setup]),
         {**row, "at flange mm": None, "note": f"the 50 disagree by {disagree:.1f} mm"},
@@ -62,7 +62,7 @@ def _stored_rows(setup: str, batch: Path) -> list[Row]:
 
 
 def _printed_row(setup: str, values: Sequence[float]) -> Row:
-    return _row(setup, "the paper", dict(zip(AXES, values, strict=True)), {})
+    return _row(setup, "the paper", dict(zip(AXIS_COLOURS, values, strict=True)), {})
 
 
 def _icp_row(setup: str, session: SessionRow, how: str) -> Row:
@@ -76,7 +76,7 @@ def _kinect_row(session: SessionRow) -> Row:
     normals, distance = session.row["steps.2.normals"], session.row["steps.2.distance"]
     what = f"{NORMALS[normals]}, pairs within {distance} mm"
     if not session.accepted:
-        return {**_row(setup, what, dict.fromkeys(AXES), {}), "note": session.row["reason"]}
+        return {**_row(setup, what, dict.fromkeys(AXIS_COLOURS), {}), "note": session.row["reason"]}
     found = session.figures(ICP)
     return _row(setup, what, _printed_units(found), found)
 
@@ -88,7 +88,10 @@ def _row(
     return {
         "setup": setup,
         "source": source,
-        **{f"{axis} {'mm' if len(axis) == 1 else 'deg'}": _signed(values[axis]) for axis in AXES},
+        **{
+            f"{axis} {'mm' if len(axis) == 1 else 'deg'}": _signed(values[axis])
+            for axis in AXIS_COLOURS
+        },
         "at flange mm": None if at_flange is None else float(np.linalg.norm(at_flange)),
         "note": None,
     }
@@ -100,7 +103,7 @@ def _signed(value: float | None) -> str | None:
 
 def _printed_units(found: Mapping[str, float]) -> dict[str, float]:
     degrees = float(np.degrees(1.0))
-    return {axis: found[axis] * (1e3 if len(axis) == 1 else degrees) for axis in AXES}
+    return {axis: found[axis] * (1e3 if len(axis) == 1 else degrees) for axis in AXIS_COLOURS}
 
 
 def _iterations(session: SessionRow) -> int:
@@ -113,7 +116,7 @@ def _iteration_row(session: SessionRow) -> Row:
     return {
         "normals": session.row["steps.2.normals"],
         "iterations": _iterations(session),
-        **{axis: values[axis] for axis in AXES},
+        **{axis: values[axis] for axis in AXIS_COLOURS},
         "rms": found["rms"] * 1e3,
     }
 

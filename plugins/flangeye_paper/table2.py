@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye.types.geometry import rpy_from_rotation
 from flangeye_paper.tables import (
-    AXES,
+    AXIS_COLOURS,
     PRINTED,
     TABLE_2,
     Row,
@@ -88,7 +88,7 @@ def _error(result: dict[str, Any]) -> Floats:
 
 
 def _columns() -> list[str]:
-    return [f"{axis} {'mm' if len(axis) == 1 else 'deg'}" for axis in AXES]
+    return [f"{axis} {'mm' if len(axis) == 1 else 'deg'}" for axis in AXIS_COLOURS]
 
 
 def _row(trials: Trials) -> Row:

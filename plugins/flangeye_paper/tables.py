@@ -102,7 +102,7 @@ def _text(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-AXES: Mapping[str, str] = {
+AXIS_COLOURS: Mapping[str, str] = {
     "x": "#d97706", "y": "#1d4ed8", "z": "#15803d",
     "roll": "#d97706", "pitch": "#1d4ed8", "yaw": "#15803d",
 }  # fmt: skip
@@ -134,7 +134,7 @@ class Look(NamedTuple):
     colour: str
 
 
-METHODS: Mapping[str, Look] = {
+METHOD_LOOKS: Mapping[str, Look] = {
     "all-data": Look("least squares on all poses", "#64748b"),
     "algorithm-1-oracle": Look("Algorithm 1, its cost knows the truth (emulation)", "#d97706"),
     "algorithm-1-held-out": Look("Algorithm 1, held-out cost", "#be123c"),

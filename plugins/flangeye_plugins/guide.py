@@ -30,7 +30,7 @@ from flangeye_plugins.weld.touch.pivot import Pivot, pivot
 from flangeye_plugins.weld.touch.tag_observation import TagDetector, TagReading
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter
 
-EACH = 5
+READINGS = 5
 """Readings at each place with the tip held."""
 
 STROKE = 2e-3
@@ -112,7 +112,7 @@ def _guided(
         pivoted = None
         if body:
             with arm.standing() as robot:
-                hand = HandGuide(robot, ask, lambda: readings(robot).take(EACH))
+                hand = HandGuide(robot, ask, lambda: readings(robot).take(READINGS))
                 pivoted = ToolPoints(hand.tip(finger, found), hand.torch())
     measured = found.lateral is not None
     if not measured and finger.calibration is not None:
@@ -206,7 +206,7 @@ class ReadingGuide:
                 state.base_T_flange.translation - start.base_T_flange.translation
             )
             force = _difference(state.force, start.force)
-            for reading in self.take(EACH):
+            for reading in self.take(READINGS):
                 yield HeldReading(reading, -moved, None if force is None else base_R_tool.T @ force)
         self._go(start.base_T_flange, np.zeros(3))
 

@@ -16,7 +16,7 @@ from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
 from flangeye.types import CAMERA, CircleFeature, Floats, HandEye, Observation, TransformEstimate
 from flangeye.types.geometry import covariance_at, kabsch, rotation_exp, rotation_log
-from flangeye_emulators.acquire.moments import FACING, CameraView, Moments
+from flangeye_emulators.acquire.moments import MOST_OBLIQUE, CameraView, Moments
 from flangeye_emulators.acquire.planned_session import plan_session
 from flangeye_emulators.acquire.simulated_scans import ScanParams
 from flangeye_emulators.world.raycast import pixels_of
@@ -63,7 +63,9 @@ def session(name: str, seed: int, scale: float = 1.0) -> tuple[Moments, list[Obs
     """Return a session, and what a scanner sees that bends by ``scale`` times its file's size."""
     configuration, given = CONFIGURATIONS[name]
     rng, params = np.random.default_rng(seed), ScanParams.model_validate(given)
-    view = CameraView(params.distance, SCANNER.near, SCANNER.far, SCANNER.field_of_view, FACING)
+    view = CameraView(
+        params.distance, SCANNER.near, SCANNER.far, SCANNER.field_of_view, MOST_OBLIQUE
+    )
     planned = plan_session(ROBOT, None, configuration, (params, view), rng)
     size = max(scale * SCANNER.calibration_error, 1e-12)
     distortion, found = Distortion(SCANNER, PIXELS, size, rng), []

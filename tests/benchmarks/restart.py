@@ -20,7 +20,7 @@ from flangeye.files.paths import place_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.workflow import batch
 from flangeye.workflow.batch import Request
-from flangeye.workflow.batch.dataset import BLOCK, Dataset, columns_of, row_of
+from flangeye.workflow.batch.dataset import FILE_SESSIONS, Dataset, columns_of, row_of
 from flangeye.workflow.batch.outcome import SessionOutcome
 from flangeye.workflow.batch.plan import plan, software_of
 
@@ -43,7 +43,7 @@ def write_rows(request: Request, registry: Registry) -> None:
         rows = [
             row_of(s, replace(OUTCOME, holdout_rms_m=1e-4 + 1e-9 * i), columns) for i, s in some
         ]
-        dataset.write_part(some[0][0] // BLOCK, some[0][1].number, rows)
+        dataset.write_part(some[0][0] // FILE_SESSIONS, some[0][1].number, rows)
 
 
 def main(count: int) -> None:

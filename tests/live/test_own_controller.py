@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flangeye_emulators.controllers.client import OWN, PORT
+from flangeye_emulators.controllers.client import CONTROL_PORT, OWN
 
 pytestmark = pytest.mark.realtime
 
@@ -34,7 +34,7 @@ def host_of(run):
 def listens(host):
     with socket.socket() as line:
         line.settimeout(1.0)
-        return line.connect_ex((host, PORT)) == 0
+        return line.connect_ex((host, CONTROL_PORT)) == 0
 
 
 def until(condition, patience):

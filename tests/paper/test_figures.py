@@ -11,7 +11,7 @@ import pytest
 from flangeye import FlangeyeError
 from flangeye_paper import fig9, fig10, fig11, heldout, table1, table2
 from flangeye_paper.__main__ import refreshed
-from flangeye_paper.tables import AXES, METHODS, read_csv, read_sessions, write_csv
+from flangeye_paper.tables import AXIS_COLOURS, METHOD_LOOKS, read_csv, read_sessions, write_csv
 
 REALISED = "verify.realisations"
 WORSE = {"all-data": 1.02, "algorithm-1-oracle": 3.2, "algorithm-1-held-out": 2.9, "robust": 1.03}
@@ -19,8 +19,10 @@ WORSE = {"all-data": 1.02, "algorithm-1-oracle": 3.2, "algorithm-1-held-out": 2.
 
 def figures_at(noise, factor):
     """What verify.realisations would say of a method so much worse than the bound."""
-    found = {f"{axis}_std": noise * factor for axis in AXES}
-    found |= {f"{axis}_mean": 0.0 for axis in AXES} | {f"bound_{axis}": noise for axis in AXES}
+    found = {f"{axis}_std": noise * factor for axis in AXIS_COLOURS}
+    found |= {f"{axis}_mean": 0.0 for axis in AXIS_COLOURS} | {
+        f"bound_{axis}": noise for axis in AXIS_COLOURS
+    }
     found |= {"workspace_rms": 0.28 * noise * factor, "bound_workspace_rms": 0.28 * noise}
     found |= {"inliers_alone_rms": 0.28 * noise, "centre_x_std": noise, "centre_y_std": noise}
     return found | {"realisations": 100.0, "refused": 0.0}
@@ -50,7 +52,7 @@ def test_fig9_tells_growth_and_ratios(fig9_batches: Any, tmp_path: Path) -> None
     assert float(robust["times the inliers alone"]) == pytest.approx(1.03)
     pools = read_csv(tmp_path / "fig9_pools.csv")
     assert [float(row["x: all data / Algorithm 1"]) for row in pools] == pytest.approx([4, 6])
-    assert len(read_csv(tmp_path / "fig9.csv")) == 2 * 2 * len(METHODS)
+    assert len(read_csv(tmp_path / "fig9.csv")) == 2 * 2 * len(METHOD_LOOKS)
     assert (tmp_path / "fig9.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -70,13 +72,13 @@ def test_fig10_shows_every_method_at_the_work(fig9_batches: Any, tmp_path: Path)
 
 
 def icp_figures(y):
-    found = dict.fromkeys(AXES, 1e-3) | {"y": y}
+    found = dict.fromkeys(AXIS_COLOURS, 1e-3) | {"y": y}
     found |= {f"flange_{axis}": 1e-4 for axis in "xyz"}
     return found | {"rms": 2e-4, "share": 1.0, "iterations": 5.0}
 
 
 def test_table1_puts_the_printed_numbers_beside_ours(batch: Any, tmp_path: Any) -> None:
-    stored = dict.fromkeys(AXES, 2e-3) | {f"{axis}_std": 1e-4 for axis in AXES}
+    stored = dict.fromkeys(AXIS_COLOURS, 2e-3) | {f"{axis}_std": 1e-4 for axis in AXIS_COLOURS}
     for name in ("ur5", "franka"):
         batch(f"table1_{name}", ({}, table1.STORED, stored))
     both = [{"steps.2.normals": kind} for kind in table1.NORMALS]
@@ -117,7 +119,7 @@ def stored_results(folder, robot):
 def test_fig11_compares_runs_with_those_stored(batch: Callable[..., Any], tmp_path: Path) -> None:
     for robot in fig11.ROBOTS:
         stored_results(tmp_path / "published", robot)
-    figures = {f"{axis}_{n:02d}": 1e-4 for axis in AXES for n in (4, 5, 6)}
+    figures = {f"{axis}_{n:02d}": 1e-4 for axis in AXIS_COLOURS for n in (4, 5, 6)}
     late = {name: value for name, value in figures.items() if not name.endswith("04")}
     step = "verify.algorithm_1_by_iteration"
     sessions = [({"seed": i}, step, found | {"others_rms": 7e-4})

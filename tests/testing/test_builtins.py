@@ -25,8 +25,8 @@ from flangeye.testing import (
     VerifyConformance,
     ViewConformance,
 )
-from flangeye.testing.solving import CAMERA as KIT_CAMERA
 from flangeye.testing.solving import HERE
+from flangeye.testing.solving import TRUE_CAMERA as KIT_CAMERA
 from flangeye.types import (
     BASE,
     CAMERA,

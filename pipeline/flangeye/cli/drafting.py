@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flangeye.workflow.recipe.draft import Draft, Questions
     from flangeye.workflow.recipe.draft.survey import FolderSurvey
 
-ANSWERS = {
+ANSWER_HELP = {
     "robot": "Robot model, its .urdf or .yaml file, or none.",
     "plate": "Flange plate, for example ISO 9409-1-50-4-M6.",
     "scanner": "Scanner model, or none.",
@@ -60,7 +60,7 @@ def _with_answers(command: Any) -> Any:
             name.replace("-", "_"), Parameter.KEYWORD_ONLY, default=None,
             annotation=Annotated[str | None, typer.Option(f"--{name}", help=text)],
         )
-        for name, text in ANSWERS.items()
+        for name, text in ANSWER_HELP.items()
     ]  # fmt: skip
     folder, ros2, *rest, _ = signature(command, eval_str=True).parameters.values()
     flags = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in rest]
@@ -93,7 +93,7 @@ def init(
     if out.exists():
         raise RecipeError(f"{out}: exists already; choose another name with --out")
     registry = load_plugins()
-    given = {name: answers[name.replace("-", "_")] for name in ANSWERS}
+    given = {name: answers[name.replace("-", "_")] for name in ANSWER_HELP}
     questions = Questions(given, None if yes else _prompt)
     draft = (_of_what_runs if ros2 else _of_folder)(folder, out, questions, registry)
     texts = {**draft.files, out: draft.text}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from flangeye.workflow.log.read import RunLog
 
 
-FORMATS = "'flangeye export --list' names the formats"
+FORMATS_HINT = "'flangeye export --list' names the formats"
 Camera = Annotated[str | None, typer.Option(help="Camera to export, for a cell with several.")]
 Anyway = Annotated[
     bool,
@@ -67,7 +67,7 @@ def export(
     from flangeye.files.regular import write_whole
 
     if to is None:
-        raise StageError(f"--to: is missing, for example --to ros2_launch; {FORMATS}")
+        raise StageError(f"--to: is missing, for example --to ros2_launch; {FORMATS_HINT}")
     if to == "tables":
         _write_tables(run, out)
         return
@@ -141,7 +141,7 @@ def _format_named(to: str, registry: Registry) -> str:
         return f"export.{spoken[0]}"
     near = [name for name in words if to.lower() in name] or spoken or nearest(to, words)
     hint = f"did you mean {' or '.join(near[:3])}? " if near else ""
-    raise StageError(f"--to {to}: is not a format; {hint}{FORMATS}")
+    raise StageError(f"--to {to}: is not a format; {hint}{FORMATS_HINT}")
 
 
 def _exported(

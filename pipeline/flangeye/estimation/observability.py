@@ -21,12 +21,12 @@ from flangeye.types.geometry import invert, kabsch, levers, rotation_exp, rotati
 
 FINEST_NOISE = 1e-5
 """No scanner and arm together do better than 10 um; keeps exact inputs from seeming observable."""
-STILL = np.radians(0.5), 1e-3
+NO_MOTION = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
 
 IN_LINE = 0.1
 """Points lie on a line when they are no further from it than this share of its length."""
-NAMED = 0.1
+UNKNOWN_SHARE = 0.1
 """A frame of which a weak move has this share, or more, is one that it leaves unknown."""
 
 Motion = TypeVar("Motion")
@@ -385,7 +385,9 @@ def _of_what(problem: Problem, weak: Floats) -> str:
         for at, kind in ((0, "rotation"), (3, "translation"))
     }
     camera = problem.ends[0][0]
-    of_camera = [kind for (name, kind), size in shares.items() if size > NAMED and name == camera]
+    of_camera = [
+        kind for (name, kind), size in shares.items() if size > UNKNOWN_SHARE and name == camera
+    ]
     named = camera if of_camera else max(shares, key=lambda key: shares[key])[0]
     what = " and ".join(of_camera) if of_camera else "part"
     return f"{what} of {names[named]} is not observable from these poses"
@@ -489,7 +491,7 @@ def _refusal(
 
 def _named(problem: Problem, weak: WeakModes, scale: Floats) -> list[str]:
     share = np.abs(weak.moves / scale[:, None]).reshape(len(problem.unknown), -1).max(axis=1)
-    return [name for name, most in zip(problem.unknown, share, strict=True) if most > NAMED]
+    return [name for name, most in zip(problem.unknown, share, strict=True) if most > UNKNOWN_SHARE]
 
 
 def _asked(problem: Problem, motions: Sequence[Move]) -> list[str]:
@@ -563,7 +565,7 @@ def _information_if_moved(problem: Problem, places: Places, name: str, twist: Fl
 
 
 def _turns(poses: Floats) -> bool:
-    return bool(np.linalg.norm(_turns_of(poses), axis=1).max() >= STILL[0])
+    return bool(np.linalg.norm(_turns_of(poses), axis=1).max() >= NO_MOTION[0])
 
 
 def _fault_of(poses: Floats) -> str | None:
@@ -592,12 +594,12 @@ def _about_one_line(poses: Floats) -> bool:
     shifts = poses[:, :3, 3] - (rotations @ poses[0, :3, 3])
     rows = stack_rows(np.eye(3) - rotations)
     centre = np.linalg.lstsq(rows, shifts.ravel(), rcond=None)[0]
-    return bool(np.abs(rows @ centre - shifts.ravel()).max() < STILL[1])
+    return bool(np.abs(rows @ centre - shifts.ravel()).max() < NO_MOTION[1])
 
 
 def _stands_still(poses: Floats) -> bool:
     shifts = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
-    return not _turns(poses) and bool(shifts.max() < STILL[1])
+    return not _turns(poses) and bool(shifts.max() < NO_MOTION[1])
 
 
 def _turns_of(poses: Floats) -> Floats:

@@ -40,7 +40,7 @@ SETS = 80
 """Small sets drawn: with 40 % of the sightings wrong, four are all right once in eight draws."""
 LEVER = 0.3
 """Lever that converts rotations to lengths [m]: a typical distance of a target."""
-NOISE = 0.2e-3, 0.1e-3
+START_NOISE = 0.2e-3, 0.1e-3
 """Noise of an arm's poses beyond the features' own while nothing is known of it: [rad] and [m]."""
 GOOD = 25.0
 """Multiple of the median square up to which a sighting agrees with the initial guess. Generous, as
@@ -79,7 +79,7 @@ def agreeing(problem: Problem, squares: Floats) -> Mask:
 
 def _plausible(problem: Problem, squares: Floats) -> bool:
     """Whether the better half of every pair agrees to 1 %, which mixed-up frames would not."""
-    middles = _middles(problem, squares) * NOISE[1] ** 2
+    middles = _middles(problem, squares) * START_NOISE[1] ** 2
     extent = problem.seen.centres.var(axis=0).sum()
     return bool(middles.max() < 0.01 * max(extent, 1e-4))
 
@@ -221,7 +221,7 @@ def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
             least = min(least, float(np.median(tried[-1][1])))
         if draw < 0:
             of_all = least
-    floor = (LEVER * NOISE[0]) ** 2 + NOISE[1] ** 2
+    floor = (LEVER * START_NOISE[0]) ** 2 + START_NOISE[1] ** 2
     scale = GOOD * max(least, floor)
     best = min(tried, key=lambda each: float(np.minimum(each[1], scale).sum()), default=None)
     return None if best is None else best[0]
@@ -438,7 +438,7 @@ def _descended(
     s, q = problem.seen, problem.seen.projectors.copy()
     if turns_alone:
         q[:, 3:, 3:] = 0.0
-    further = np.diag(np.repeat(np.square(NOISE), 3))
+    further = np.diag(np.repeat(np.square(START_NOISE), 3))
     weights = q @ np.linalg.inv(q @ (s.covariances + further) @ q + (np.eye(6) - q)) @ q
     damping, before = 1e-6, np.inf
     linear = problem.linearised(places)

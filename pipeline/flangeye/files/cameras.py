@@ -17,11 +17,11 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.clouds.plain import load_npy
-from flangeye.files.documents import KINDS, document_of
+from flangeye.files.documents import DOCUMENT_READERS, document_of
 from flangeye.files.regular import read_text
 from flangeye.types import Floats
 
-MATRICES = (
+CAMERA_MATRICES = (
     "cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "matrix", "k", "m",
 )  # fmt: skip
 """Names of the camera matrix. Like all names here they are in lower case, without separators."""
@@ -68,7 +68,7 @@ def cameras_in(folder: Path) -> list[CameraFile]:
     Raises:
         StageError: As :func:`camera_in`.
     """
-    names = (*KINDS, *LABELLED)
+    names = (*DOCUMENT_READERS, *LABELLED)
     inside = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.suffix.lower() in names)
     # A file that is larger [bytes] holds recordings, and is not looked into
     files = sorted(p for p in inside if p.is_file() and p.stat().st_size <= 1_000_000)
@@ -202,7 +202,7 @@ def _one_by_one(values: Mapping[str, Any]) -> Floats | None:
 
 def _named(values: Mapping[str, Any], behind: Iterable[str]) -> Floats | None:
     """Return the matrix whose name has one of these endings; None if there is none."""
-    for name in (f"{name}{which}" for name in MATRICES for which in behind):
+    for name in (f"{name}{which}" for name in CAMERA_MATRICES for which in behind):
         value = values.get(name)
         if isinstance(value, Mapping):
             value = _matrix(_plain(value))

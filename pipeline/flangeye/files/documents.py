@@ -21,10 +21,10 @@ from flangeye.files.arrays import read_arrays
 from flangeye.files.processes import python_command
 from flangeye.files.regular import read_regular, read_text
 from flangeye.files.words import reason_of
-from flangeye.files.yaml_lines import MAX_BYTES, parse_yaml
+from flangeye.files.yaml_lines import YAML_BYTES, parse_yaml
 from flangeye.types import Floats
 
-MATRICES = ((4, 4), (3, 4), (3, 3))
+MATRIX_SHAPES = ((4, 4), (3, 4), (3, 3))
 """Shapes of a pose, of a pose without its last row, and of a rotation."""
 
 
@@ -41,7 +41,7 @@ def document_of(file: Path) -> TableDocument | None:
     Raises:
         StageError: It cannot be read, or is damaged.
     """
-    read = KINDS.get(file.suffix.lower())
+    read = DOCUMENT_READERS.get(file.suffix.lower())
     if read is None:
         return None
     try:
@@ -80,8 +80,8 @@ def _toml(file: Path) -> TableDocument | None:
 
 def _yaml(file: Path) -> TableDocument:
     text = read_text(file)
-    if len(text) > MAX_BYTES:
-        raise StageError(f"{file}: is larger than {MAX_BYTES} bytes; write it as .json")
+    if len(text) > YAML_BYTES:
+        raise StageError(f"{file}: is larger than {YAML_BYTES} bytes; write it as .json")
     text = re.sub(
         r"\n---\s*\Z",
         "\n",
@@ -139,7 +139,7 @@ def _value(text: str, listed: bool) -> Any:
 def _python(file: Path) -> TableDocument:
     """Return the lists of numbers that a script assigns or appends; nothing of it is run."""
     data: dict[str, Any] = {}
-    for node in ast.walk(ast.parse(read_text(file, MAX_BYTES))):
+    for node in ast.walk(ast.parse(read_text(file, YAML_BYTES))):
         match node:
             case ast.Assign(targets=[ast.Name(id=name)], value=value):
                 data |= _literal(name, value)
@@ -202,7 +202,7 @@ def _matlab(file: Path) -> TableDocument:
     return TableDocument(data, lambda at: f"{file}: row {at + 1}")
 
 
-KINDS: Mapping[str, Callable[[Path], TableDocument | None]] = {
+DOCUMENT_READERS: Mapping[str, Callable[[Path], TableDocument | None]] = {
     ".json": _json, ".jsonl": _json_lines, ".ndjson": _json_lines,
     ".yaml": _yaml, ".yml": _yaml, ".samples": _yaml, ".xml": _xml,
     ".py": _python, ".toml": _toml, ".ini": _toml, ".npz": _numpy, ".npy": _numpy, ".mat": _matlab,
@@ -232,7 +232,7 @@ def _plain(value: Any) -> Any:
 
 def stacked(rows: Floats) -> Floats | None:
     """Return the matrices (N, r, c) of an array (N r, c) that stacks them; None if it does not."""
-    for lines, width in MATRICES:
+    for lines, width in MATRIX_SHAPES:
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
             continue
         stack = rows.reshape(-1, lines, width)
@@ -250,7 +250,7 @@ def _poses_first(array: Floats) -> Floats:
     if stack is not None and len(stack) > 1:
         return stack
     shape = array.shape
-    if len(shape) == 3 and shape[:2] in MATRICES and shape[1:] not in MATRICES:
+    if len(shape) == 3 and shape[:2] in MATRIX_SHAPES and shape[1:] not in MATRIX_SHAPES:
         return np.moveaxis(array, 2, 0)
     # A pose has at most 16 numbers; a wider array of few rows holds one pose a column
     wide = len(shape) == 2 and shape[0] in (3, 6, 7, 12, 16) and shape[1] > 16

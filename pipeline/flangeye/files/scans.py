@@ -117,7 +117,7 @@ def _list(names: Sequence[str]) -> str:
     return ", ".join(names[:shown]) + more
 
 
-CLOUDS = (".pcd", ".ply", ".npy", ".xyz", ".pts", ".asc")
+CLOUD_SUFFIXES = (".pcd", ".ply", ".npy", ".xyz", ".pts", ".asc")
 POINTS = (".csv", ".txt", ".npz")
 """Files that hold points or poses; their content decides which."""
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -133,7 +133,7 @@ def scans_in(folder: Path, stem: str = "*") -> list[Path]:
     """
     files = sorted(folder.glob(f"{stem}.*"), key=lambda p: (natural(p.stem), p.suffix))
     points = texts_of_points(files)
-    known = [p for p in files if p.suffix.lower() in (*CLOUDS, *IMAGES) or p in points]
+    known = [p for p in files if p.suffix.lower() in (*CLOUD_SUFFIXES, *IMAGES) or p in points]
     found = [p for p in known if not is_matrix(p)]
     foreign = [p for p in files if p.suffix.lower() in VENDOR]
     if foreign and not found:
@@ -290,7 +290,7 @@ def _kinds(scans: Sequence[Path]) -> set[bool]:
 
 def is_cloud(path: Path) -> bool:
     """Return whether a scan is a cloud, by its ending, or a depth image."""
-    return path.suffix.lower() in (*CLOUDS, *POINTS) or is_depth_image(path)
+    return path.suffix.lower() in (*CLOUD_SUFFIXES, *POINTS) or is_depth_image(path)
 
 
 def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
@@ -320,7 +320,7 @@ def with_companion(recording: Recording) -> Recording:
     if recording.cloud and not recording.image:
         return replace(recording, image=_beside(recording.cloud, IMAGES))
     if recording.image and not recording.cloud:
-        return replace(recording, cloud=_beside(recording.image, CLOUDS))
+        return replace(recording, cloud=_beside(recording.image, CLOUD_SUFFIXES))
     return recording
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from flangeye.errors import RecipeError
 
-LONGEST = 160
+QUOTED = 160
 """Most characters quoted of a parser's message; some messages quote the whole file."""
 
 
@@ -20,7 +20,7 @@ def require_name(where: str, name: str) -> str:
     # Exports write these names into other programs' files: no quotes, line breaks or markup.
     if not re.fullmatch(r"\w[\w ./:+()\-]{0,127}", name):
         raise RecipeError(
-            f"{where}: {name[:LONGEST]!a} is not a valid name: letters, digits and _ . / : + - ( ) "
+            f"{where}: {name[:QUOTED]!a} is not a valid name: letters, digits and _ . / : + - ( ) "
             "or a space are allowed, 128 at most; rename it in the file"
         )
     return name
@@ -40,7 +40,7 @@ def printable(text: str) -> str:
 def reason_of(error: BaseException) -> str:
     """Return a library's message about damaged input as one short line."""
     line = printable(str(error)).strip().partition("\n")[0].strip()
-    return line[:LONGEST] or type(error).__name__
+    return line[:QUOTED] or type(error).__name__
 
 
 def nearest(word: str, known: Iterable[str], n: int = 3, cutoff: float = 0.6) -> list[str]:

@@ -22,7 +22,7 @@ import yaml
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 
-MAX_BYTES = 1_000_000
+YAML_BYTES = 1_000_000
 
 _INTEGER = re.compile(r"[-+]?\d+")
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -58,7 +58,7 @@ def read_yaml(path: Path) -> Document:
     Raises:
         RecipeError: It cannot be read or is not plain YAML; names the line and the cure.
     """
-    return parse_yaml(read_text(path, MAX_BYTES, RecipeError), str(path))
+    return parse_yaml(read_text(path, YAML_BYTES, RecipeError), str(path))
 
 
 def parse_yaml(text: str, name: str) -> Document:

@@ -23,7 +23,7 @@ ROUNDS = 20
 RESTLESS = 0.01
 """Share of a thinned group's points that may still change before the whole group is used."""
 
-ENOUGH = 2000
+PLANE_POINTS = 2000
 """Number of points that suffices to distinguish one plane from another."""
 
 
@@ -66,7 +66,7 @@ def fit_plane(points: Floats, towards: Floats) -> Plane:
     return Plane(point, normal, SIGMA_OF_MAD * float(median(np.abs(normal @ offsets))))
 
 
-def thinned(points: NDArray[Number], enough: int = ENOUGH) -> NDArray[Number]:
+def thinned(points: NDArray[Number], enough: int = PLANE_POINTS) -> NDArray[Number]:
     """Return every n-th of N points: enough to distinguish planes."""
     return points[:: 1 + len(points) // enough]
 
@@ -102,7 +102,7 @@ def robust_planes(
     """
     if not groups:
         return []
-    few = [points[:: 1 + len(points) // ENOUGH] for points in groups]
+    few = [points[:: 1 + len(points) // PLANE_POINTS] for points in groups]
     rows, slabs = _Rows.of(few, rough), _Slabs.at(rough, gates)
     more = any(len(some) < len(points) for some, points in zip(few, groups, strict=True))
     _of_majority(rows, slabs, RESTLESS)

@@ -23,11 +23,11 @@ Grey = NDArray[np.uint8]
 FEWEST_CHARUCO = 6
 """Fewest corners of a ChArUco board from which its pose is estimated."""
 
-WIDTH = 640
+FIRST_WIDTH = 640
 """Width to which an image is reduced before all families are tried [px], to save time."""
 
 
-ACROSS = 4.0
+PROFILE = 4.0
 """Half the length of the profiles across a side [px]."""
 
 PROFILES = 60
@@ -95,7 +95,7 @@ def board_seen(view: Grey) -> SeenBoard | None:
         return _board_of(*markers, grey)
     # The search for a board of any size is slow, so the image is reduced: a board worth fitting is
     # large in it.
-    by = min(1.0, 2 * WIDTH / grey.shape[1])
+    by = min(1.0, 2 * FIRST_WIDTH / grey.shape[1])
     small: Grey = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA).astype(
         np.uint8
     )
@@ -212,7 +212,7 @@ def _family_in(grey: Grey) -> tuple[str, list[int]] | None:
     """Return the first family of which an image shows markers, and their ids in order."""
     import cv2
 
-    by = min(1.0, WIDTH / grey.shape[1])
+    by = min(1.0, FIRST_WIDTH / grey.shape[1])
     small = cv2.resize(grey, None, fx=by, fy=by, interpolation=cv2.INTER_AREA)
     # One dictionary of each kind: 4X4_250 begins with the markers of 4X4_50.
     for name in DICTIONARIES:
@@ -350,7 +350,7 @@ def corners_of_square(grey: NDArray[np.uint8], rough: Floats, image: Image) -> F
     # back.
     corners = _bent(np.array([c[:2] / c[2] for c in crossed]), image)
     # A corner that moves farther than the profiles reach was found on another edge.
-    near = np.linalg.norm(corners - rough, axis=1).max() < ACROSS
+    near = np.linalg.norm(corners - rough, axis=1).max() < PROFILE
     return np.asarray(corners) if near else rough
 
 
@@ -382,7 +382,7 @@ def _side(grey: NDArray[np.uint8], start: Floats, end: Floats, image: Image) -> 
     along = end - start
     length = float(np.linalg.norm(along))
     # A marker's border is a tenth of its side: longer profiles would reach its inner pattern
-    reach = min(ACROSS, 0.07 * length)
+    reach = min(PROFILE, 0.07 * length)
     # Profiles shorter than this [px] are steep all along
     if reach < 1.5:
         return None

@@ -18,7 +18,7 @@ import numpy as np
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.words import reason_of
-from flangeye.files.yaml_lines import MAX_BYTES, read_yaml
+from flangeye.files.yaml_lines import YAML_BYTES, read_yaml
 from flangeye.models.robots import Joint, RobotModel, Volume
 from flangeye.types.geometry import rotation_from_rpy
 
@@ -49,7 +49,7 @@ def _from_controller(robot: RobotModel, path: Path) -> RobotModel:
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"))
     deltas = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
     try:
-        parser.read_string(read_text(path, MAX_BYTES, RecipeError))
+        parser.read_string(read_text(path, YAML_BYTES, RecipeError))
         rows = [_numbers(parser["mounting"][name]) for name in deltas]
     except (configparser.Error, KeyError, ValueError, OSError) as error:
         raise RecipeError(

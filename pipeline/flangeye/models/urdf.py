@@ -27,10 +27,10 @@ from flangeye.types.geometry import (
 )
 from flangeye.units import SI
 
-MAX_BYTES = 10_000_000
+URDF_BYTES = 10_000_000
 TURNS = ("revolute", "continuous")
 MOVES = (*TURNS, "prismatic")
-NAMED = 8
+LINKS_NAMED = 8
 """Links that a message names."""
 
 
@@ -147,7 +147,7 @@ def read_urdf(path: Path) -> Urdf:
     Raises:
         RecipeError: It is not XML, not a URDF, or a xacro that was not expanded.
     """
-    return parse_urdf(read_text(path, MAX_BYTES, RecipeError), path)
+    return parse_urdf(read_text(path, URDF_BYTES, RecipeError), path)
 
 
 def parse_urdf(text: str, path: Path) -> Urdf:
@@ -390,7 +390,7 @@ def flange_links(urdf: Urdf) -> list[str]:
             return named
     parents = {end_of(joint, "parent") for joint in urdf.above.values()}
     ends = [name for name in urdf.moved() if name not in parents]
-    if not 1 < len(ends) <= NAMED:
+    if not 1 < len(ends) <= LINKS_NAMED:
         return ends
     chains = {end: urdf.chain(end) for end in ends}
     return _before_fingers(chains) or ends
@@ -421,7 +421,7 @@ def _flange(urdf: Urdf, asked: str | None) -> str:
         return links[0]
     raise RecipeError(
         f"{urdf.path}: which link is the flange, its origin in the plate's face and z outwards? "
-        f"write flange: {' or '.join(links[:NAMED]) or 'NAME'}"
+        f"write flange: {' or '.join(links[:LINKS_NAMED]) or 'NAME'}"
     )
 
 
@@ -434,8 +434,8 @@ def _known(urdf: Urdf, asked: str, what: str) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
+    more = f" and {len(names) - LINKS_NAMED} more" if len(names) > LINKS_NAMED else ""
+    return ", ".join(names[:LINKS_NAMED]) + more
 
 
 def _shared(first: list[ET.Element], second: list[ET.Element]) -> int:

@@ -12,7 +12,7 @@ from flangeye import types as t
 from flangeye.types import Box, Floats
 from flangeye.types.geometry import nearest_rotation, rotation_log
 
-ENOUGH = np.radians(5.0)
+LEAST_TURN = np.radians(5.0)
 """A turn by less does not count as one."""
 
 
@@ -31,7 +31,7 @@ class Coverage:
 
     def __str__(self) -> str:
         """Return the coverage as a line of text."""
-        both = int((self.turns.min(axis=1) >= ENOUGH).sum())
+        both = int((self.turns.min(axis=1) >= LEAST_TURN).sum())
         angles = [f"-{low:.0f} to +{high:.0f}" for low, high in np.degrees(self.turns)]
         named = ", ".join(f"{axis} {angle}" for axis, angle in zip("xyz", angles, strict=True))
         return (
@@ -44,7 +44,7 @@ class Coverage:
         out = []
         far = np.radians(20.0)  # as the solver asks for
         for name, turns in zip("xyz", self.turns, strict=True):
-            if turns.min() < ENOUGH:
+            if turns.min() < LEAST_TURN:
                 low, high = np.degrees(turns)
                 out.append(
                     f"turn the flange both ways about base {name}, by {np.degrees(far):.0f} deg or "

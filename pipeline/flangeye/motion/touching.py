@@ -18,7 +18,7 @@ from flangeye.motion.route import Barred, Route, Router
 from flangeye.types import Floats
 from flangeye.types.geometry import rigid
 
-SHORT = 0.005
+STOP_BEFORE = 0.005
 """It stops this far before the point [m]: a wrong matrix must not drive it into the work."""
 
 
@@ -63,8 +63,8 @@ class Toucher:
     def touch(self, points: Floats, move: bool) -> Iterator[Touched]:
         """Drive the tip to points (N, 3) in ``base``; yield each contact.
 
-        With ``move`` the arm goes to :data:`SHORT` before each, in the orientation that it has. The
-        arm is released before the person is asked to jog, and only read afterwards.
+        With ``move`` the arm goes to :data:`STOP_BEFORE` before each, in the orientation that it
+        has. The arm is released before the person is asked to jog, and only read afterwards.
 
         Raises:
             StageError: No collision-free path leads to a point; the message names the obstacle.
@@ -85,11 +85,11 @@ class Toucher:
         """Refuse an arm that is not at its goal after it was released."""
         tip = self._tip_at(read_state(self.driver)[1].base_T_flange.matrix)
         away = float(np.linalg.norm(tip - point))
-        if away > 2 * SHORT:
+        if away > 2 * STOP_BEFORE:
             raise DeviceError(
-                f"the arm was sent to {SHORT * 1e3:g} mm before point {number} and its tip stands "
-                f"{away * 1e3:.0f} mm from it: it moved since, or it is an emulator that starts "
-                "anew with each connection (start 'flangeye emulator' and name its address with "
+                f"the arm was sent to {STOP_BEFORE * 1e3:g} mm before point {number} and its tip "
+                f"stands {away * 1e3:.0f} mm from it: it moved since, or it is an emulator that "
+                "starts anew with each connection (start 'flangeye emulator' and name its address with "
                 "--set)"
             )
 
@@ -97,7 +97,9 @@ class Toucher:
         """Drive to before a point, by a way that was checked as a whole."""
         state = read_state(self.driver)[1]
         ways = self._ways(number, point, state.base_T_flange.rotation, state.joints)
-        self.ask(f"point {number}: the arm will go to {SHORT * 1e3:g} mm before it; keep clear")
+        self.ask(
+            f"point {number}: the arm will go to {STOP_BEFORE * 1e3:g} mm before it; keep clear"
+        )
         with watched(self.driver, self.model, self._slowly()) as arm:
             for way in ways:
                 arm.go(way)
@@ -110,7 +112,7 @@ class Toucher:
         ways = []
         # The tip goes to this distance before a point first, then on along the tool [m]
         above = 0.05
-        for before in (above, SHORT):
+        for before in (above, STOP_BEFORE):
             pose = rigid(turn, point - before * along - turn @ self.tip)
             found = arm.inverse_near(pose, joints[None])
             way = router.route(joints, found[0]) if len(found) else Barred("out of the arm's reach")

@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from flangeye.plugin.stage import Part, Stage
     from flangeye.types import Capture, Rejection, Source
 
-NAME = "flangeye"
+PROJECT = "flangeye"
 """Entry-point group and pluggy project name."""
 
-hookspec = pluggy.HookspecMarker(NAME)
-hookimpl = pluggy.HookimplMarker(NAME)
+hookspec = pluggy.HookspecMarker(PROJECT)
+hookimpl = pluggy.HookimplMarker(PROJECT)
 
 
 @hookspec

@@ -18,7 +18,7 @@ from flangeye.files.processes import require_memory
 from flangeye.files.words import nearest
 from flangeye.models.robots import RobotModel
 from flangeye.plugin import hookspecs
-from flangeye.plugin.hookspecs import NAME
+from flangeye.plugin.hookspecs import PROJECT
 from flangeye.plugin.stage import Part, Plugin, Siblings, Stage
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ def load_registry() -> Registry:
     Raises:
         DuplicatePluginError: Two plugins offer the same stage or part.
     """
-    hooks = pluggy.PluginManager(hookspecs.NAME)
+    hooks = pluggy.PluginManager(hookspecs.PROJECT)
     hooks.add_hookspecs(hookspecs)
     registry = Registry(hooks)
     for entry_point in sorted(installed_plugins(), key=_builtin_first):
@@ -286,7 +286,7 @@ def installed_plugins() -> list[EntryPoint]:
 @cache
 def _found(_: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Return the plugins on a search path; to look reads the metadata of every package there."""
-    return tuple(entry_points(group=NAME))
+    return tuple(entry_points(group=PROJECT))
 
 
 def _of_current_folder(plugin: EntryPoint) -> bool:

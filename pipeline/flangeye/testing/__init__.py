@@ -34,7 +34,7 @@ from flangeye.testing.devices import (
 )
 from flangeye.testing.percapture import FitConformance, SegmentConformance
 from flangeye.testing.solving import (
-    CAMERA,
+    TRUE_CAMERA,
     RefineConformance,
     SolveConformance,
     VerifyConformance,
@@ -142,7 +142,7 @@ class GuideConformance(Conformance):
 def pose_error(shift: Floats, turn: Floats | None = None) -> t.PoseError:
     """Return an error that moves the work by ``shift`` [m] and turns it about itself [rad]."""
     rotation = rotation_exp(np.zeros(3) if turn is None else turn)
-    return t.PoseError(rigid(rotation, AT + shift - rotation @ AT), AT, CAMERA[:3, :3])
+    return t.PoseError(rigid(rotation, AT + shift - rotation @ AT), AT, TRUE_CAMERA[:3, :3])
 
 
 class CostConformance(Conformance):
@@ -194,30 +194,30 @@ class ErrorConformance(Conformance):
 
     def test_it_gives_the_same_twice(self) -> None:
         """Equal input, equal output, to the last bit."""
-        require_repeats(lambda: self.measured(CAMERA, observed(work_points())))
+        require_repeats(lambda: self.measured(TRUE_CAMERA, observed(work_points())))
 
     def test_the_true_pose_has_next_to_no_error(self) -> None:
         """The true pose has no error beyond the noise."""
-        off = np.linalg.norm(self.measured(CAMERA, observed(work_points())).displacement())
+        off = np.linalg.norm(self.measured(TRUE_CAMERA, observed(work_points())).displacement())
         require(off < 0.1e-3, f"the true pose is said to be {1e3 * off:.3f} mm off")
 
     def test_a_candidate_that_is_off_is_off_by_so_much(self) -> None:
         """A candidate that is 3 mm off has an error of 0.003 m at the work."""
-        candidate = CAMERA.copy()
+        candidate = TRUE_CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
         off = np.linalg.norm(self.measured(candidate, observed(work_points())).displacement())
         require(abs(off - 3e-3) < 0.1e-3, f"3 mm are said to be {1e3 * off:.3f} mm")
 
     def test_too_little_is_refused(self) -> None:
         """Without kept poses the part refuses or returns None."""
-        require_refusal(lambda: self.measured(CAMERA, []), type(None), "no pose kept")
+        require_refusal(lambda: self.measured(TRUE_CAMERA, []), type(None), "no pose kept")
 
     def test_it_measures_in_the_cameras_frame(self) -> None:
         """The motion maps the measurement onto the candidate's prediction."""
-        candidate = CAMERA.copy()
+        candidate = TRUE_CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
         off = self.measured(candidate, observed(work_points())).displacement()
-        expected = -CAMERA[:3, :3].T @ np.array([1e-3, -2e-3, 2e-3])
+        expected = -TRUE_CAMERA[:3, :3].T @ np.array([1e-3, -2e-3, 2e-3])
         require_close(off, expected, 0.1e-3, "the error of a candidate, in camera [m]")
 
 

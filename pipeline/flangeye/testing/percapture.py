@@ -48,7 +48,9 @@ WALL = 1.1
 """Depth of the wall behind it [m]."""
 
 
-FACING = rigid(rotation_exp(np.array([np.pi - 0.25, 0.15, 0.3])), np.array([0.01, -0.02, DEPTH]))
+FLANGE_POSE = rigid(
+    rotation_exp(np.array([np.pi - 0.25, 0.15, 0.3])), np.array([0.01, -0.02, DEPTH])
+)
 """``camera_T_flange``: towards the camera, tilted."""
 
 
@@ -75,7 +77,7 @@ class Change:
         return np.asarray(xyz @ self.matrix.T)
 
 
-SAME = Change()
+UNCHANGED = Change()
 MOVED = Change(rotation_exp(np.array([0.02, -0.03, 0.6])), np.array([0.03, 0.02, 0.05]))
 
 
@@ -121,9 +123,9 @@ class Scene:
 def flange_scene(flange: Flange) -> Scene:
     """Return a flange's face with its holes, on a wrist of its rim's size, before a wall."""
     rays = _rays()
-    centre, normal = FACING[:3, 3], FACING[:3, 2]
+    centre, normal = FLANGE_POSE[:3, 3], FLANGE_POSE[:3, 2]
     xyz = rays * (centre @ normal / (rays @ normal))[..., None]
-    local = (xyz - centre) @ FACING[:3, :3]
+    local = (xyz - centre) @ FLANGE_POSE[:3, :3]
     wall = rays * WALL
     return Scene(
         np.where(_on_face(flange, local)[..., None], xyz, wall), centre, normal, flange.rim
@@ -133,7 +135,7 @@ def flange_scene(flange: Flange) -> Scene:
 def sphere_scene(sphere: Sphere) -> Scene:
     """Return a ball before a wall."""
     rays = _rays()
-    centre = FACING[:3, 3]
+    centre = FLANGE_POSE[:3, 3]
     along, square = rays @ centre, (rays**2).sum(axis=-1)
     inside = along**2 - square * (centre @ centre - sphere.radius**2)
     near = (along - np.sqrt(np.maximum(inside, 0.0))) / square
@@ -199,7 +201,7 @@ class PerCaptureConformance(Conformance):
         """Return the stage's input."""
         raise NotImplementedError
 
-    def answer(self, change: Change = SAME) -> tuple[Any, Scene]:
+    def answer(self, change: Change = UNCHANGED) -> tuple[Any, Scene]:
         """Return the stage's output on the changed scene, and the scene."""
         scene = self.scene().changed(change)
         known: Mapping[Any, Any] = {
@@ -226,7 +228,7 @@ class PerCaptureConformance(Conformance):
 
     def test_it_is_right_in_metres_and_in_the_cameras_frame(self) -> None:
         """The centre found in a scan without noise is within tolerance."""
-        self._require_centre(SAME, "a plain scan")
+        self._require_centre(UNCHANGED, "a plain scan")
 
     def test_it_moves_with_the_scene(self) -> None:
         """If the scene is rotated and shifted, the answer moves with it."""

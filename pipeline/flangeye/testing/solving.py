@@ -20,17 +20,17 @@ from flangeye.testing.base import (
     require_round_trip,
     require_type,
 )
-from flangeye.testing.percapture import FACING, flange_scene
+from flangeye.testing.percapture import FLANGE_POSE, flange_scene
 from flangeye.types import Floats
 from flangeye.types.geometry import kabsch, kabsch_covariance, rigid, rotation_exp
 
-CAMERA = rigid(rotation_exp(np.array([3.0, 0.2, -0.4])), np.array([0.6, -0.1, 1.2]))
+TRUE_CAMERA = rigid(rotation_exp(np.array([3.0, 0.2, -0.4])), np.array([0.6, -0.1, 1.2]))
 """``base_T_camera`` of the kit's cell."""
 
 WORK = np.array([0.55, -0.05, 0.45])
 """Middle of the work, in ``base`` [m]."""
 
-SIZE = np.array([0.3, 0.3, 0.2])
+WORK_SIZE = np.array([0.3, 0.3, 0.2])
 """Extent of the work along each axis [m]."""
 
 NOISE = 0.05e-3
@@ -46,7 +46,7 @@ HERE = np.eye(4)
 
 
 def observed(
-    points: Floats, base_T_camera: Floats = CAMERA, noise: float = NOISE, normals: bool = True
+    points: Floats, base_T_camera: Floats = TRUE_CAMERA, noise: float = NOISE, normals: bool = True
 ) -> list[t.Observation]:
     """Return observations of flanges at (N, 3) points in ``base``."""
     rng = np.random.default_rng(1)
@@ -72,7 +72,7 @@ def observed(
 
 def work_points(count: int = POSES) -> Floats:
     """Return points spread over the work, in ``base`` [m]."""
-    return np.asarray(WORK + np.random.default_rng(2).uniform(-0.5, 0.5, (count, 3)) * SIZE)
+    return np.asarray(WORK + np.random.default_rng(2).uniform(-0.5, 0.5, (count, 3)) * WORK_SIZE)
 
 
 def reference_solution(observations: Sequence[t.Observation]) -> t.HandEye:
@@ -109,12 +109,12 @@ class SolvingConformance(Conformance):
     def views(self, motion: Floats = HERE) -> t.Views:
         """Return a segmented scan that is kept for verifying, as the true camera sees it."""
         cloud = flange_scene(self.flange).flange_cloud()
-        pose = t.Transform(t.BASE, t.FLANGE, motion @ CAMERA @ FACING)
+        pose = t.Transform(t.BASE, t.FLANGE, motion @ TRUE_CAMERA @ FLANGE_POSE)
         return t.Views([t.VerificationView("view", cloud, pose)])
 
     def stream(self, observations: Sequence[t.Observation]) -> t.Observations:
         """Return observations as the steps before give them."""
-        workspace = t.Box(WORK, SIZE)
+        workspace = t.Box(WORK, WORK_SIZE)
         source = t.Source("kit", workspace=workspace)
         return t.Observations(observations, source, len(observations))
 
@@ -124,7 +124,7 @@ class SolvingConformance(Conformance):
             t.Observations: self.stream(observations),
             t.Solver: reference_solution,
             t.Views: self.views(motion),
-            t.Box: t.Box(t.Transform(t.BASE, t.BASE, motion).apply(WORK), SIZE),
+            t.Box: t.Box(t.Transform(t.BASE, t.BASE, motion).apply(WORK), WORK_SIZE),
         }
 
     def _require_pose(self, answer: t.HandEye, expected: Floats, within: float, what: str) -> None:
@@ -160,7 +160,7 @@ class SolveConformance(SolvingConformance):
     def test_it_finds_the_camera_in_metres(self) -> None:
         """A known cell with 0.05 mm of noise."""
         answer = self.answer(observed(work_points()))
-        self._require_pose(answer, CAMERA, self.tolerance, "a known cell")
+        self._require_pose(answer, TRUE_CAMERA, self.tolerance, "a known cell")
 
     def test_it_accounts_for_every_observation(self) -> None:
         """One pair for each observation, with correct residuals."""
@@ -188,11 +188,11 @@ class SolveConformance(SolvingConformance):
         """If the robot's base is moved, the answer moves with it."""
         moved = elsewhere(observed(work_points()), MOTION)
         within = 2 * self.tolerance
-        self._require_pose(self.answer(moved), MOTION @ CAMERA, within, "a base elsewhere")
+        self._require_pose(self.answer(moved), MOTION @ TRUE_CAMERA, within, "a base elsewhere")
 
     def test_it_scales_with_the_cell(self) -> None:
         """Everything a quarter larger."""
-        camera = CAMERA.copy()
+        camera = TRUE_CAMERA.copy()
         camera[:3, 3] *= 1.25
         answer = self.answer(observed(1.25 * work_points(), camera))
         self._require_pose(answer, camera, 1.25 * self.tolerance, "a larger cell")
@@ -202,7 +202,7 @@ class SolveConformance(SolvingConformance):
         points = work_points()
         points[:, 2] = WORK[2]
         answer = self.answer(observed(points, noise=NOISE / 5))
-        self._require_pose(answer, CAMERA, self.tolerance, "centres in one plane")
+        self._require_pose(answer, TRUE_CAMERA, self.tolerance, "centres in one plane")
 
     def test_too_little_is_refused(self) -> None:
         """Two poses, all poses at one place, centres on a line."""
@@ -229,13 +229,13 @@ class RefineConformance(SolvingConformance):
     def test_it_leaves_a_good_calibration_good(self) -> None:
         """Refining the solution of a known cell with 0.05 mm of noise keeps it within tolerance."""
         answer = self.answer(observed(work_points()))
-        self._require_pose(answer, CAMERA, self.tolerance, "a good calibration")
+        self._require_pose(answer, TRUE_CAMERA, self.tolerance, "a good calibration")
         require_covariance(answer.camera.covariance, "the pose's covariance")
 
     def test_it_moves_with_the_base(self) -> None:
         """If the robot's base is moved, the answer moves with it."""
         answer = self.answer(elsewhere(observed(work_points()), MOTION), MOTION)
-        self._require_pose(answer, MOTION @ CAMERA, 2 * self.tolerance, "a base elsewhere")
+        self._require_pose(answer, MOTION @ TRUE_CAMERA, 2 * self.tolerance, "a base elsewhere")
 
 
 class VerifyConformance(SolvingConformance):

@@ -33,7 +33,7 @@ REACH = 5.0
 """No arm's flange is farther from its base: a larger number is in millimetres [m]."""
 
 
-CAMERA = rigid(rotation_exp(np.array([np.pi, 0.0, 0.0])), np.array([0.5, 0.0, 1.1]))
+SOURCE_CAMERA = rigid(rotation_exp(np.array([np.pi, 0.0, 0.0])), np.array([0.5, 0.0, 1.1]))
 """``base_T_camera`` of the kit's cell: it looks down at the work."""
 
 
@@ -176,9 +176,9 @@ class PlanConformance(Conformance):
         """Return the plan for the kit's site, or for one whose work is at another place."""
         shift = np.zeros(3) if moved is None else moved
         arm = Arm(self.robot)
-        eye = CAMERA[:3, 3] + shift
+        eye = SOURCE_CAMERA[:3, 3] + shift
         site = Site(
-            centre=CAMERA[:3, 3] + 0.7 * CAMERA[:3, 2] + shift,
+            centre=SOURCE_CAMERA[:3, 3] + 0.7 * SOURCE_CAMERA[:3, 2] + shift,
             eye=eye,
             facing=lambda point: _facing(np.asarray(point), eye),
             joints=lambda pose: np.zeros(arm.n),

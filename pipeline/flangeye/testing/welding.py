@@ -16,7 +16,7 @@ from flangeye.testing.base import (
     require_round_trip,
     require_type,
 )
-from flangeye.testing.solving import CAMERA, WORK, observed, reference_solution, work_points
+from flangeye.testing.solving import TRUE_CAMERA, WORK, observed, reference_solution, work_points
 
 
 def verified() -> t.VerifiedHandEye:
@@ -74,7 +74,7 @@ class SeamConformance(OnceConformance):
 
     def test_it_lies_in_the_cell_in_metres(self) -> None:
         """Not in the camera's frame, not in millimetres."""
-        far = float(np.linalg.norm(self.answer().points_in_base - CAMERA[:3, 3], axis=1).max())
+        far = float(np.linalg.norm(self.answer().points_in_base - TRUE_CAMERA[:3, 3], axis=1).max())
         limit = 5 * self.scanner.far
         require(far < limit, f"the seam is {far:.3g} m from the camera, which sees {limit / 5:.3g}")
 

@@ -36,7 +36,7 @@ UNSEEN = 60
 """Number of poses that are not used for calibration, at which the true error is measured."""
 UPRIGHT = np.radians([0, -90, 90, -90, -90, 0])
 """Joints of an arm at its first pose."""
-FACING = float(np.radians(50.0))
+MOST_OBLIQUE = float(np.radians(50.0))
 """A camera sees a target whose z is this far from the view at most [rad]."""
 FIELD = float(np.radians(50.0)), float(np.radians(40.0))
 """Horizontal and vertical field of view of a camera that is not a scanner [rad]."""

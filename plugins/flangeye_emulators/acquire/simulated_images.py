@@ -17,7 +17,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, Image, PointCloud, Seed
 from flangeye.types.geometry import invert
-from flangeye_emulators.acquire.moments import FACING, VERSION, CameraView
+from flangeye_emulators.acquire.moments import MOST_OBLIQUE, VERSION, CameraView
 from flangeye_emulators.acquire.planned_session import ViewParams, plan_session, source_of
 from flangeye_emulators.world.board_image import BoardCamera, Cover, render_board
 from flangeye_emulators.world.mesh import MATERIALS, box
@@ -109,7 +109,7 @@ def acquire_simulated_images(
     if eye is not None:
         camera = camera_of(eye.pixels, camera)
         near, far = eye.scanner.near, eye.scanner.far
-    view = CameraView(params.distance, near, far, _field(camera), FACING)
+    view = CameraView(params.distance, near, far, _field(camera), MOST_OBLIQUE)
     moments = plan_session(robot, second, configuration, (params, view), rng)
     studio = _CellScene(BOARDS[params.board], camera, eye)
     covers = _covers(params, rng)

@@ -26,8 +26,8 @@ from flangeye.types import (
 )
 from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_emulators.acquire.moments import (
-    FACING,
     FIELD,
+    MOST_OBLIQUE,
     VERSION,
     CameraView,
     Moments,
@@ -79,7 +79,7 @@ def acquire_simulated_marker(
         StageError: The camera does not see the marker at enough poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    view = CameraView(params.distance, 0.3, 2.0, FIELD, FACING)
+    view = CameraView(params.distance, 0.3, 2.0, FIELD, MOST_OBLIQUE)
     moments = plan_session(robot, second, configuration, (params, view), rng)
     errors = params.noise * rng.standard_normal((len(moments), 6))
     wrong = params.wrong(len(moments), rng)
@@ -105,7 +105,7 @@ class SimulatedCellParams(OutlierParams, CellSessionParams):
             return CameraView(
                 0.0, near, 2.5, (np.radians(60.0), np.radians(50.0)), np.radians(65.0)
             )
-        return CameraView(0.0, near, 2.0, FIELD, FACING)
+        return CameraView(0.0, near, 2.0, FIELD, MOST_OBLIQUE)
 
 
 @stage("acquire.simulated_cell")

@@ -14,7 +14,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.models.targets import Sphere
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, Capture, Captures, Floats, PointCloud, Seed
-from flangeye_emulators.acquire.moments import FACING, VERSION, CameraView
+from flangeye_emulators.acquire.moments import MOST_OBLIQUE, VERSION, CameraView
 from flangeye_emulators.acquire.planned_session import SessionParams, plan_session, source_of
 
 FAN = float(np.radians(28.0))
@@ -71,7 +71,7 @@ def acquire_simulated_profiles(
         StageError: The laser cuts the sphere at too few poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    seen = (params.near + params.far) / 2, params.near, params.far, (FAN, 0.0), FACING
+    seen = (params.near + params.far) / 2, params.near, params.far, (FAN, 0.0), MOST_OBLIQUE
     # Joint vectors tried: a laser passes a small sphere at few of them
     view = ProfileView(*seen, 60_000, sphere.radius)
     moments = plan_session(robot, None, configuration, (params, view), rng)

@@ -16,7 +16,7 @@ from flangeye.models.targets import Flange
 from flangeye.plugin.stage import stage
 from flangeye.types import CAMERA, TARGET, Capture, Captures, Observation, PointCloud, Seed
 from flangeye_emulators.acquire.moments import (
-    FACING,
+    MOST_OBLIQUE,
     VERSION,
     CameraView,
     Moments,
@@ -57,7 +57,9 @@ def acquire_simulated_session(  # noqa: PLR0913  what it asks the runner for
         StageError: The circle is in view at too few poses.
     """
     rng = np.random.default_rng([VERSION, seed])
-    view = CameraView(params.distance, scanner.near, scanner.far, scanner.field_of_view, FACING)
+    view = CameraView(
+        params.distance, scanner.near, scanner.far, scanner.field_of_view, MOST_OBLIQUE
+    )
     moments = plan_session(robot, second, configuration, (params, view), rng)
     eyes = {CAMERA: scanner_of(scanner, params.resolution, params.noise, rng)}
     sightings = [(i, CAMERA, TARGET) for i in range(params.poses)]
@@ -83,7 +85,7 @@ def acquire_simulated_cell_scans(
     """
     _require_flanges(cell)
     rng = np.random.default_rng([VERSION, seed])
-    view = CameraView(0.0, scanner.near, scanner.far, scanner.field_of_view, FACING)
+    view = CameraView(0.0, scanner.near, scanner.far, scanner.field_of_view, MOST_OBLIQUE)
     planned = plan_cell(cell, seed, params, view, rng)
     eyes = {
         camera: scanner_of(scanner, params.resolution, params.noise, rng.spawn(1)[0])

@@ -158,7 +158,7 @@ class AuboController(ControlUnit):
         return {"robot_mode": self.robot_mode, "safety": self.safety}
 
 
-MARK, _HEADER = b"SOF\x01", struct.Struct(">4sI")
+MARK, _FRAME_HEADER = b"SOF\x01", struct.Struct(">4sI")
 """Header of a frame: the mark, and the length of the content."""
 
 
@@ -187,22 +187,22 @@ class RpcSession(Connection):
     def received(self, data: bytes) -> None:
         """Answer each complete frame."""
         self._buffer += data
-        while len(self._buffer) >= _HEADER.size:
-            mark, length = _HEADER.unpack_from(self._buffer)
+        while len(self._buffer) >= _FRAME_HEADER.size:
+            mark, length = _FRAME_HEADER.unpack_from(self._buffer)
             # Bytes of a body after which a client is cut off
             if mark != MARK or length > 1 << 20:
                 self.abort()
                 return
-            end = _HEADER.size + length
+            end = _FRAME_HEADER.size + length
             if len(self._buffer) < end:
                 return
-            body, self._buffer = self._buffer[_HEADER.size : end], self._buffer[end:]
+            body, self._buffer = self._buffer[_FRAME_HEADER.size : end], self._buffer[end:]
             self.send(frame(answer(self._box, body)))
 
 
 def frame(body: bytes) -> bytes:
     """Return a message body with its header: marker and length."""
-    return _HEADER.pack(MARK, len(body)) + body
+    return _FRAME_HEADER.pack(MARK, len(body)) + body
 
 
 def answer(box: AuboController, body: bytes) -> bytes:
@@ -220,7 +220,7 @@ def answer(box: AuboController, body: bytes) -> bytes:
 
 def _outcome(box: AuboController, request: dict[str, Any]) -> dict[str, Any]:
     name = str(request["method"]).removeprefix("rob1.")
-    method = METHODS.get(name)
+    method = RPC_METHODS.get(name)
     if method is None:
         # JSON-RPC 2.0, section 5.1
         return _error(-32601, f"{name} is not simulated")
@@ -258,7 +258,7 @@ def _set_tool(box: AuboController, params: Mapping[str, Any]) -> int:
     return OK
 
 
-METHODS: dict[str, Method] = {
+RPC_METHODS: dict[str, Method] = {
     "getRobotNames": _method(lambda box: ["rob1"]),
     "getAxisNames": _method(lambda box: []),
     "SystemInfo.getInterfaceVersionCode": _method(lambda box: 24001),

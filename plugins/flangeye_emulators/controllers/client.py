@@ -16,7 +16,7 @@ from flangeye.motion.arm import run_number
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import SpringSurface
 
-PORT = 29998
+CONTROL_PORT = 29998
 """Port of the control channel. It is defined here because a client imports no server code."""
 
 
@@ -51,7 +51,7 @@ class EmulatorControl(Device):
     ``with EmulatorControl("127.0.0.5") as control: control.fault("freeze=3 s")``
     """
 
-    def __init__(self, host: str, port: int = PORT, patience: float = 5.0) -> None:
+    def __init__(self, host: str, port: int = CONTROL_PORT, patience: float = 5.0) -> None:
         """Connect.
 
         Args:

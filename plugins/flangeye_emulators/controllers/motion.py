@@ -21,7 +21,7 @@ from flangeye_emulators.controllers.poses import (
     rotation_vector,
 )
 
-SLOWEST = 1e-4
+LEAST_SPEED = 1e-4
 """Speeds and accelerations below this are taken as this: a move must end."""
 
 
@@ -56,9 +56,9 @@ class Travel:
     ) -> None:
         """Plan the move to ``end``; ``between`` returns the target at a share of the way."""
         self._between, self._end, self._length = between, end, length
-        self._acceleration = max(acceleration, SLOWEST)
+        self._acceleration = max(acceleration, LEAST_SPEED)
         # Accelerating all the way and braking would meet at the second speed.
-        self._top = min(max(speed, SLOWEST), math.sqrt(self._acceleration * self._length))
+        self._top = min(max(speed, LEAST_SPEED), math.sqrt(self._acceleration * self._length))
         self._up = self._top / self._acceleration
         cruised = max(self._length - self._top * self._up, 0.0)
         self._cruise = cruised / self._top if self._top else 0.0
@@ -126,7 +126,7 @@ class Speed:
     def step(self, dt: float, here: JointStance) -> Floats:
         """Return the next target: pose (4, 4) or joints (n,)."""
         change = self.target - self._velocity
-        allowed = max(self.acceleration, SLOWEST) * dt
+        allowed = max(self.acceleration, LEAST_SPEED) * dt
         self._velocity = self._velocity + change * min(1.0, allowed / max(self._size(change), 1e-9))
         self.done = not self._velocity.any() and not self.target.any()
         if self.in_space:

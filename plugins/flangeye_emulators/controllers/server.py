@@ -25,7 +25,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.elsewhere import is_this_machine
 from flangeye.models.graph import EmulatorOptions
 from flangeye_emulators.controllers.arm import ControlUnit, SpringSurface, starting_joints
-from flangeye_emulators.controllers.client import PORT
+from flangeye_emulators.controllers.client import CONTROL_PORT
 from flangeye_emulators.controllers.network import (
     FaultInjector,
     LineConnection,
@@ -93,7 +93,7 @@ class Server:
         # The control channel has a wire of its own, to which nothing happens. Whoever reaches it
         # moves the arm and causes faults: it does not leave this machine.
         self._behind = Network(options.host if is_this_machine(options.host) else "127.0.0.1")
-        self._behind.offer(PORT, lambda: ControlSession(self._behind, self._actions))
+        self._behind.offer(CONTROL_PORT, lambda: ControlSession(self._behind, self._actions))
         self._schedule = Schedule(self._fault_injector.kinds)
         self._clock = ControllerClock(box.cycle, self._step)
         self._cycle = 0
@@ -144,15 +144,15 @@ class Server:
         ports = ", ".join(f"{name} {port}" for name, port in self._ports.items())
         return (
             f"{self._options.robot.model} on {self._options.host}: {ports}, "
-            f"control {PORT}{self._where_control_is()}; Ctrl-C ends it"
+            f"control {CONTROL_PORT}{self._where_control_is()}; Ctrl-C ends it"
         )
 
     def _where_control_is(self) -> str:
         if self._behind.host == self._options.host:
             return ""
         return (
-            f" on {self._behind.host} alone (from elsewhere: ssh -L {PORT}:{self._behind.host}:"
-            f"{PORT} HOST)"
+            f" on {self._behind.host} alone (from elsewhere: ssh -L {CONTROL_PORT}:"
+            f"{self._behind.host}:{CONTROL_PORT} HOST)"
         )
 
     def _farewell(self) -> str:

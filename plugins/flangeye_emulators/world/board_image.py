@@ -12,7 +12,7 @@ from flangeye.types import CAMERA, Floats, Image, PointCloud
 
 PER_SQUARE = 120
 """Pixels of the print along a square; more than any camera resolves of it."""
-FINE = 2
+RAYS_PER_PIXEL = 2
 """Rays a pixel along each axis: what it averages over."""
 GROUND = 90
 """Grey behind the paper."""
@@ -125,13 +125,13 @@ def _seen(
         # Grey of what lies over the board
         seen[cover.hides(board, across, down)] = 25
     height, width = rows.stop - rows.start, columns.stop - columns.start
-    return np.asarray(seen.reshape(height, FINE, width, FINE).mean(axis=(1, 3)))
+    return np.asarray(seen.reshape(height, RAYS_PER_PIXEL, width, RAYS_PER_PIXEL).mean(axis=(1, 3)))
 
 
 def _between(pixels: slice) -> Floats:
     """Return the coordinates of several rays through each pixel of a row [px]."""
-    count = FINE * (pixels.stop - pixels.start)
-    return np.asarray(pixels.start + (np.arange(count) + 0.5) / FINE - 0.5)
+    count = RAYS_PER_PIXEL * (pixels.stop - pixels.start)
+    return np.asarray(pixels.start + (np.arange(count) + 0.5) / RAYS_PER_PIXEL - 0.5)
 
 
 def _window(board: Board, camera_T_target: Floats, camera: BoardCamera) -> tuple[slice, slice]:

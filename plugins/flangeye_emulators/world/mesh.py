@@ -23,7 +23,7 @@ from flangeye.types.geometry import basis_of_plane
 
 Ints = NDArray[np.int32]
 
-FINE = 720
+SEGMENTS = 720
 """Segments of a circle that is measured: at 50 mm the polygon is 0.5 um inside it at most."""
 
 COARSE = 96
@@ -68,7 +68,7 @@ def circle(radius: float, segments: int, centre: tuple[float, float] = (0.0, 0.0
 
 def lathe(
     profile: Sequence[tuple[float, float]],
-    segments: int = FINE,
+    segments: int = SEGMENTS,
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Mesh:
     """Return the surface of revolution of a profile of (radius, z) about an axis along z."""
@@ -125,7 +125,7 @@ def _inside(points: Floats, loop: Floats) -> NDArray[np.bool_]:
     return np.asarray((crosses & (x < at)).sum(axis=1) % 2 == 1)
 
 
-def disc(radius: float, z: float, segments: int = FINE) -> Mesh:
+def disc(radius: float, z: float, segments: int = SEGMENTS) -> Mesh:
     """Return a flat disc about the z axis."""
     return region(circle(radius, segments), [], z)
 

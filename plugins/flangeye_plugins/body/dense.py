@@ -20,7 +20,7 @@ from flangeye.types.geometry import hat, rigid, rotation_exp
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape
 from flangeye_plugins.body.view import spacing_of, view_of
 
-FEWEST = 60
+FEWEST_ON_BODY = 60
 """Smallest number of points for a fit."""
 
 
@@ -147,7 +147,7 @@ def fitted(points: Singles, shape: Shape, start: Floats, most: int = 12_000) -> 
         start: (4, 4) start pose ``camera_T_body``, close to the solution.
         most: Largest number of points to use.
     """
-    if len(points) < FEWEST:
+    if len(points) < FEWEST_ON_BODY:
         return None
     laid = _PreparedScan.of(points, shape, most)
     rest = laid.settled(start)
@@ -221,7 +221,7 @@ class _PreparedScan:
             if not rounding.any():
                 model = _visible_ends(shape, pose, self.spacing)
             ends = _ends(self.edges, model, shape, pose, scanner[:-1], beside)
-            if len(surface.residual) < FEWEST:
+            if len(surface.residual) < FEWEST_ON_BODY:
                 return None
             noise = _deviation(surface.residual)
             # So few edge points are not used at all
@@ -321,7 +321,7 @@ def _rounding(points: Floats, shape: Shape, pose: Floats, spacing: float) -> Flo
             # Neighbouring rays meet the same surface if their depths differ by less than 5 times
             # their distance: an incidence below 79 degrees
             total += np.where(np.abs(off) < 5.0 * reach * spacing, off, np.nan)
-    few = np.isfinite(total).sum() < FEWEST
+    few = np.isfinite(total).sum() < FEWEST_ON_BODY
     return np.zeros(len(points)) if few else total / len(sides)
 
 

@@ -298,7 +298,7 @@ HELPS = 0.7
 """A correction that explains the samples leaves at most this share of the errors held out."""
 
 
-EXPLAINED = 0.2
+MISFIT_SHARE = 0.2
 """And at most this share of how far the samples are apart."""
 
 
@@ -438,12 +438,12 @@ def helps(session: RecordedSession, corrected: RecordedSession) -> bool:
     # Errors that sound samples have, too: growing up to these is no loss [of the spread, rad]
     none_worse = (after <= np.maximum(1.2 * before, np.array([0.02, 0.01])[: len(after)])).all()
     better = (after <= HELPS * before).any() and none_worse
-    return bool(better and after[0] <= EXPLAINED)
+    return bool(better and after[0] <= MISFIT_SHARE)
 
 
 def explained(session: RecordedSession) -> bool:
     """Return whether the samples predict each other, unlike unrelated ones."""
-    return bool(_held_out_medians(session)[0] <= EXPLAINED)
+    return bool(_held_out_medians(session)[0] <= MISFIT_SHARE)
 
 
 def moved_helps(session: RecordedSession, after: Mask) -> bool:
@@ -453,7 +453,7 @@ def moved_helps(session: RecordedSession, after: Mask) -> bool:
     first, second = (held_out_errors(equations, mask) for mask in (after, ~after))
     halves = np.where(np.isfinite(first), first, second)
     one, two = (np.nanmedian(errors, axis=0) for errors in (whole, halves))
-    return bool(two[0] <= min(HELPS * one[0], EXPLAINED * _spread(session)))
+    return bool(two[0] <= min(HELPS * one[0], MISFIT_SHARE * _spread(session)))
 
 
 def held_out_errors(equations: Equations, ignored: Mask) -> Floats:

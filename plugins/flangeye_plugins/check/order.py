@@ -211,7 +211,7 @@ def _fits(
     return given, fit(equations_of(*tried).without(~known)), against.reshape(-1)
 
 
-SAME = 1e-9
+NOT_MEASURED_TWICE = 1e-9
 """Numbers that differ by less were not measured twice."""
 
 
@@ -219,7 +219,7 @@ SAME = 1e-9
 def identity(session: RecordedSession) -> Findings:
     """Find identity matrices, which a driver without data returns as the pose of arm or marker."""
     for whose, poses in _reported(session):
-        robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < SAME
+        robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < NOT_MEASURED_TWICE
         if robot.any():
             what = (
                 f"{robot.sum()} of {len(session)} {whose} poses are the identity: the flange "
@@ -243,9 +243,9 @@ def _reported(session: RecordedSession) -> Iterator[tuple[str, Floats]]:
 
 
 def _is_identity(session: RecordedSession) -> Mask:
-    at_camera = np.abs(np.nan_to_num(session.centres, nan=1.0)).max(axis=1) < SAME
+    at_camera = np.abs(np.nan_to_num(session.centres, nan=1.0)).max(axis=1) < NOT_MEASURED_TWICE
     turned = np.abs(session.rotations - np.eye(3)).max(axis=(1, 2))
-    return np.asarray(at_camera & ~(turned > SAME))
+    return np.asarray(at_camera & ~(turned > NOT_MEASURED_TWICE))
 
 
 @part("check.repeated")
@@ -264,14 +264,16 @@ def _repeats(
     from scipy.spatial import KDTree
 
     read = np.flatnonzero(np.isfinite(numbers).all(axis=1))
-    alike = KDTree(numbers[read]).query_pairs(SAME, p=np.inf, output_type="ndarray")
+    alike = KDTree(numbers[read]).query_pairs(NOT_MEASURED_TWICE, p=np.inf, output_type="ndarray")
     before, after = np.sort(read[alike], axis=1).T
     # A target that has moved further was seen from another pose [m]
     moved = np.linalg.norm(others[after] - others[before], axis=1) > 1e-3
     wrong = np.zeros(len(numbers), dtype=bool)
     # Of two equal rows the later one is stale: the driver had nothing newer to return.
     wrong[after[moved]] = True
-    made_up = any((np.abs(p[wrong] - np.eye(4)) < SAME).all() for _, p in _reported(session))
+    made_up = any(
+        (np.abs(p[wrong] - np.eye(4)) < NOT_MEASURED_TWICE).all() for _, p in _reported(session)
+    )
     if wrong.any() and not made_up:
         told = f"{wrong.sum()} of {len(session)} {what}s repeat an earlier one to the last "
         yield _left_out(

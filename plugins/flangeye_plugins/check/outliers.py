@@ -160,7 +160,7 @@ def _flipped(
     return np.where(near, best, -1)
 
 
-TURN = np.radians(2.0)
+TOO_UNCERTAIN = np.radians(2.0)
 """Uncertainty of the camera's rotation that is not an answer (one sigma) [rad]."""
 SHIFT = 5e-3
 """Likewise of where it sees the work [m]."""
@@ -174,14 +174,14 @@ def motion(session: RecordedSession) -> Findings:
     session.require_samples()
     null = fit_of(session)
     turn, shift = _uncertainty(session, null)
-    if turn < TURN and shift < SHIFT:
+    if turn < TOO_UNCERTAIN and shift < SHIFT:
         yield from _offset_unknown(session)
         return
     spread, axes = _rotations(session)
     needs = not np.isfinite(session.places).all()
     name = "too little rotation" if needs else "too little motion"
     what = f"{_left_open(turn, shift)}: {_missing(session, needs, spread, axes)}"
-    if session.marks_open and turn < TURN:
+    if session.marks_open and turn < TOO_UNCERTAIN:
         yield Finding(name, what, "none needed: the recipe marks what stays open", note=True)
         return
     yield Finding(name, what, _advice(needs, axes < LITTLE <= spread))
@@ -189,7 +189,7 @@ def motion(session: RecordedSession) -> Findings:
 
 def _left_open(turn: float, shift: float) -> str:
     known = []
-    if turn >= TURN:
+    if turn >= TOO_UNCERTAIN:
         degrees = np.degrees(turn)
         known.append(
             f"rotation to {degrees:.2g} deg only" if degrees < 90 else "rotation not at all"

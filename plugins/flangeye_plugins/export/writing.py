@@ -13,7 +13,7 @@ from flangeye import Params, StageError
 from flangeye.types import CalibratedPose, Floats
 from flangeye.types.pose_formats import CONVENTIONS, PoseConvention
 
-NAME = r"^[A-Za-z][A-Za-z0-9_]{0,23}$"
+IDENTIFIER = r"^[A-Za-z][A-Za-z0-9_]{0,23}$"
 """An identifier in every controller's language; KUKA's names have 24 characters at most."""
 FRAME = r"^[A-Za-z_][A-Za-z0-9_/]*$"
 """A tf2 frame or a URDF link."""
@@ -22,7 +22,7 @@ FRAME = r"^[A-Za-z_][A-Za-z0-9_/]*$"
 class NamedParams(Params):
     """The name of the pose."""
 
-    name: str = Field("camera", pattern=NAME)
+    name: str = Field("camera", pattern=IDENTIFIER)
     """Name of the pose in the other program, and of the file."""
 
     def require_unnamed(self, pose: CalibratedPose) -> None:
@@ -90,8 +90,8 @@ def require_identifier(name: str, reserved: Iterable[str] = ()) -> str:
     Raises:
         StageError: It is not an identifier, or a reserved word of that language.
     """
-    if not re.fullmatch(NAME, name):
-        raise StageError(f"--set name: {name!a} is not an identifier; allowed: {NAME}")
+    if not re.fullmatch(IDENTIFIER, name):
+        raise StageError(f"--set name: {name!a} is not an identifier; allowed: {IDENTIFIER}")
     if name.lower() in reserved:
         raise StageError(f"--set name: '{name}' is a word of that language; choose another")
     return name

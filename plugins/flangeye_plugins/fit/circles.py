@@ -104,7 +104,7 @@ def circle_jacobian(circles: Circles, points: Floats, ring: NDArray[np.intp]) ->
     return rows.T
 
 
-ACROSS = 5
+FACE_PATCHES = 5
 """Patches across a face."""
 
 
@@ -151,10 +151,12 @@ def likeliest_plane(points: Floats, rough: Plane) -> Plane:
 
 
 def _patches(flat: Floats) -> Indices:
-    """Return the number of the patch (of ``ACROSS`` x ``ACROSS``) of each point (N, 2)."""
+    """Return the patch of each point (N, 2), one of ``FACE_PATCHES`` x ``FACE_PATCHES``."""
     low, high = flat.min(axis=0), flat.max(axis=0)
-    cell = np.minimum(((flat - low) / (high - low + 1e-12) * ACROSS).astype(np.intp), ACROSS - 1)
-    return np.asarray(cell @ [ACROSS, 1])
+    cell = np.minimum(
+        ((flat - low) / (high - low + 1e-12) * FACE_PATCHES).astype(np.intp), FACE_PATCHES - 1
+    )
+    return np.asarray(cell @ [FACE_PATCHES, 1])
 
 
 def _planes_of_patches(points: Floats, patch: Indices, rough: Plane) -> tuple[Floats, Floats]:
@@ -163,7 +165,7 @@ def _planes_of_patches(points: Floats, patch: Indices, rough: Plane) -> tuple[Fl
     The first one is the rough plane. Heights are above its point.
     """
     offsets = points - rough.point
-    members = (patch == np.arange(ACROSS**2)[:, None]).astype(np.float64)
+    members = (patch == np.arange(FACE_PATCHES**2)[:, None]).astype(np.float64)
     # Points of a patch
     members = members[members.sum(axis=1) >= 20]
     counts = members.sum(axis=1)[:, None]

@@ -22,7 +22,7 @@ from flangeye_plugins.fit.circles import (
 from flangeye_plugins.fit.ransac import circles_through
 from flangeye_plugins.fit.uncertainty import STRETCHES, clustered_covariance
 
-FEWEST_POINTS = 20
+PROFILE_POINTS = 20
 
 
 class SphereProfileParams(Params):
@@ -103,8 +103,8 @@ def fit_sphere_profile(
 
 
 def _why_no_profile(xyz: Floats) -> str | None:
-    if len(xyz) < FEWEST_POINTS:
-        return f"{len(xyz)} points, at least {FEWEST_POINTS} are needed"
+    if len(xyz) < PROFILE_POINTS:
+        return f"{len(xyz)} points, at least {PROFILE_POINTS} are needed"
     off = float(np.abs(xyz[:, 1]).max())
     # How far from its plane a profile's points may be written [m]
     if off > 1e-4:
@@ -136,7 +136,7 @@ def find_arc(
     gaps = np.linalg.norm(points[None] - centres[:, None], axis=2) - radii[:, None]
     near = (np.abs(gaps) < params.tolerance) & (points[None, :, 1] < centres[:, None, 1])
     best = int(np.argmax(near.sum(axis=1)))
-    if near[best].sum() < FEWEST_POINTS:
+    if near[best].sum() < PROFILE_POINTS:
         return Rejected(_no_arc(radius))
     return _refined(points, centres[best], float(radii[best]), params.tolerance)
 

@@ -37,7 +37,7 @@ _AUBO_VERIFICATION = "5"
 
 Poses = Mapping[str, Floats]
 
-_POSES = "calibration_robot_pose_data"
+_POSE_FILE = "calibration_robot_pose_data"
 
 
 def read_aubo(folder: Path) -> Archive:
@@ -267,11 +267,11 @@ class _Place:
     read: Callable[[Path], Archive]
 
 
-_PLACES: Mapping[str, _Place] = {
+_DATASETS: Mapping[str, _Place] = {
     "aubo": _Place(PurePosixPath("data/aubo"), "data.txt", read_aubo),
-    "ur5": _Place(PurePosixPath("data/ur5"), f"{_POSES}.npz", read_ur),
-    "ur10e": _Place(PurePosixPath("data/ur10e"), f"{_POSES}.npz", read_ur),
-    "franka": _Place(PurePosixPath("data/franka"), f"{_POSES}.npy", read_franka),
+    "ur5": _Place(PurePosixPath("data/ur5"), f"{_POSE_FILE}.npz", read_ur),
+    "ur10e": _Place(PurePosixPath("data/ur10e"), f"{_POSE_FILE}.npz", read_ur),
+    "franka": _Place(PurePosixPath("data/franka"), f"{_POSE_FILE}.npy", read_franka),
     "kinect": _Place(PurePosixPath("Kinect_Result"), "readRobot.txt", read_kinect),
     "sample-2019": _Place(
         PurePosixPath("calib_toolbox/data/2019-06-14-sample"), "calib_data.json", read_sample_2019
@@ -294,9 +294,9 @@ def ancorasir(path: Path, params: AncorasirParams) -> Archive:
     """Read the recordings published with the paper; the path is the whole folder or a part."""
     found = _recordings_in(path)
     if params.robot is not None:
-        return _PLACES[params.robot].read(_chosen(path, params.robot, found))
+        return _DATASETS[params.robot].read(_chosen(path, params.robot, found))
     if not found:
-        markers = sorted({place.marker for place in _PLACES.values()})
+        markers = sorted({place.marker for place in _DATASETS.values()})
         raise NotThisLayout(f"{path}: holds none of {', '.join(markers)}")
     if len(found) > 1:
         raise StageError(
@@ -304,13 +304,13 @@ def ancorasir(path: Path, params: AncorasirParams) -> Archive:
             f"reader: {{ancorasir: {{robot: {next(iter(found))}}}}}"
         )
     ((robot, folder),) = found.items()
-    return _PLACES[robot].read(folder)
+    return _DATASETS[robot].read(folder)
 
 
 def _chosen(path: Path, robot: str, found: Mapping[str, Path]) -> Path:
     folder = _locate(path, robot)
     if folder is None:
-        place = _PLACES[robot]
+        place = _DATASETS[robot]
         raise StageError(
             f"{path}: no recording '{robot}' (no {place.folder / place.marker}); "
             f"found: {', '.join(found) or 'none'}"
@@ -321,7 +321,7 @@ def _chosen(path: Path, robot: str, found: Mapping[str, Path]) -> Path:
 def _recordings_in(path: Path) -> dict[str, Path]:
     """Return the recordings at or below ``path``, by name, one for each folder."""
     found: dict[str, Path] = {}
-    for robot in _PLACES:
+    for robot in _DATASETS:
         folder = _locate(path, robot)
         if folder is not None and folder not in found.values():
             found[robot] = folder
@@ -330,9 +330,9 @@ def _recordings_in(path: Path) -> dict[str, Path]:
 
 def _locate(path: Path, robot: str) -> Path | None:
     """Return a recording's folder, given the repository or a folder between; else None."""
-    place = _PLACES[robot]
+    place = _DATASETS[robot]
     parts = place.folder.parts
-    others = {p.folder.name for p in _PLACES.values()} - {place.folder.name}
+    others = {p.folder.name for p in _DATASETS.values()} - {place.folder.name}
     tails = [path.joinpath(*parts[i:]) for i in range(len(parts) + 1)]
     for folder in tails:
         if folder.name not in others and _is_recording(folder, place.marker):
@@ -342,5 +342,5 @@ def _locate(path: Path, robot: str) -> Path | None:
 
 def _is_recording(folder: Path, marker: str) -> bool:
     # The Franka's folder holds an .npz too, of everything the arm was sent to.
-    shadowed = marker.endswith(".npz") and (folder / f"{_POSES}.npy").exists()
+    shadowed = marker.endswith(".npz") and (folder / f"{_POSE_FILE}.npy").exists()
     return (folder / marker).is_file() and not shadowed

@@ -40,7 +40,7 @@ from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import read_text
-from flangeye.files.scans import CLOUDS, IMAGES, is_cloud, with_companion
+from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES, is_cloud, with_companion
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.types import FLANGE, FLANGE2, Floats, Role
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
@@ -57,7 +57,7 @@ _OTHERS = ("cloud", "image", "id", "role", "time_ns")
 SECOND = "second_"
 """Prefix of the columns of a second arm's pose."""
 
-_JOINT = re.compile(r"j[1-9]\d?_rad")
+_JOINT_COLUMN = re.compile(r"j[1-9]\d?_rad")
 
 
 class FolderParams(Params):
@@ -89,7 +89,7 @@ def _poses_file(path: Path) -> Path:
         return path
     found = [path / name for name in named if (path / name).is_file()]
     if not found:
-        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in CLOUDS)
+        clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in CLOUD_SUFFIXES)
         but = f"clouds ({clouds}), but " if clouds else ""
         advice = f"; 'flangeye init {path}' writes a recipe for other layouts"
         raise NotThisLayout(f"{path}: holds {but}none of {', '.join(named)}{advice}")
@@ -143,7 +143,7 @@ def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
 def _refuse_unpaired(file: Path, recordings: Iterable[Recording]) -> None:
     known = {with_companion(recording).cloud for recording in recordings}
     for path in sorted(file.parent.iterdir()):
-        if path.suffix.lower() in CLOUDS and path not in known:
+        if path.suffix.lower() in CLOUD_SUFFIXES and path not in known:
             raise StageError(
                 f"{path}: {file.name} has no pose for it; add it, or move the cloud away"
             )
@@ -220,7 +220,7 @@ def _from_yaml(file: Path) -> tuple[PosesFile, list[int]]:
 def _from_csv(file: Path) -> tuple[PosesFile, list[int]]:
     heading, table = _cells(file)
     unit = _unit_of(file, heading)
-    joints = sorted((n for n in heading if _JOINT.fullmatch(n)), key=lambda n: int(n[1:-4]))
+    joints = sorted((n for n in heading if _JOINT_COLUMN.fullmatch(n)), key=lambda n: int(n[1:-4]))
     rows, lines = [], []
     for line, cells in table:
         if len(cells) != len(heading):
@@ -269,7 +269,7 @@ def _refuse_unknown(file: Path, heading: Sequence[str]) -> None:
         if heading.count(name) > 1:
             raise StageError(f"{file}:1: column '{name}' comes twice")
         of_second = name.startswith(SECOND) and name.removeprefix(SECOND) in of_pose
-        if name not in known and not of_second and not _JOINT.fullmatch(name):
+        if name not in known and not of_second and not _JOINT_COLUMN.fullmatch(name):
             raise StageError(
                 f"{file}:1: column '{name}' is not known; known: {', '.join(known)}, j1_rad, …, "
                 f"{SECOND}x_m, …; 'flangeye init FOLDER' writes a recipe for other columns"

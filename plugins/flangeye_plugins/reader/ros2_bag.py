@@ -43,7 +43,7 @@ from flangeye_plugins.reader.ros2_messages import (
 from flangeye_plugins.ros2.messages import Type, cloud_of, intrinsics_of, pixels_of
 
 Value = TypeVar("Value")
-ARM = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
+ARM_HINT = "robot: NAME ('flangeye robots' lists them) or robot: {urdf: arm.urdf} in the recipe"
 """Remedy that states how a recipe names its arm."""
 
 
@@ -218,7 +218,7 @@ def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) ->
     """Return the flange's poses from recorded joint angles, and a text on their source."""
     if robot is None:
         raise StageError(
-            f"{bag.path}: joint angles become poses by the arm's kinematics; write {ARM}"
+            f"{bag.path}: joint angles become poses by the arm's kinematics; write {ARM_HINT}"
         )
     if joints is None or joints[1].shape[1] != len(robot.joints):
         raise StageError(
@@ -245,7 +245,7 @@ def _ways(bag: Bag) -> str:
     }
     found = [f"reader: {{ros2_bag: {{{way}}}}} ({told})" for way, told in ways.items() if told]
     if bag.joints:
-        found.append(f"{ARM} (for the angles of {', '.join(bag.joints)})")
+        found.append(f"{ARM_HINT} (for the angles of {', '.join(bag.joints)})")
     if not found:
         return "it has neither tf nor PoseStamped nor JointState"
     return f"write {' or '.join(found)}"

@@ -50,7 +50,7 @@ from flangeye_plugins.reader.columns import (
 )
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
-JOINTS = "joints"
+BY_JOINTS = "joints"
 """Stands for a rotation: the poses follow from the joint angles."""
 
 
@@ -88,7 +88,7 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     """The table: FILE (text, JSON, YAML, OpenCV's storage, .npz, .npy, .mat, a robot program);
     FILE:PART, an array or a block of it, or FILE:1/2, half of its rows; a pattern of files with a
     row each, poses/*.json; or several, side by side."""
-    rotation: str = JOINTS
+    rotation: str = BY_JOINTS
     """How the rotations are written, see below; joints: there are the joint angles alone, and the
     recipe's robot gives the poses."""
     length: PoseLength = "m"
@@ -106,14 +106,14 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     @classmethod
     def more(cls) -> tuple[str, ...]:
         """Return also joint angles, which a table may have in place of poses."""
-        return (JOINTS,)
+        return (BY_JOINTS,)
 
     @model_validator(mode="after")
     def _convention_given(self) -> TableParams:
         missing = {"rotation", "length"} - self.model_fields_set
-        if self.rotation == JOINTS and self.joints:
+        if self.rotation == BY_JOINTS and self.joints:
             return self
-        if missing or self.rotation == JOINTS:
+        if missing or self.rotation == BY_JOINTS:
             named = " and ".join(sorted(missing, reverse=True)) or "joints"
             raise ValueError(f"{named}: is missing (joint angles alone: joints, without rotation)")
         return self
@@ -135,7 +135,7 @@ def table(path: Path, params: TableParams, kinematics: RobotModel | None = None)
 
 def _arm_poses(text: Table, params: TableParams, robot: RobotModel | None) -> Floats:
     """Return the flange's poses (N, 4, 4) [m]: as written, or from the joint angles."""
-    if params.rotation == JOINTS:
+    if params.rotation == BY_JOINTS:
         return _at_joints(text, params.angles(text), robot)
     values = text.numbers(_columns(text, params, _scan_column(text, params)))
     poses = np.array([params.value(text.where(i), row) for i, row in enumerate(values)])

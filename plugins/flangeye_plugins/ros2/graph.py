@@ -19,7 +19,7 @@ from flangeye.files.regular import read_text
 from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Ask, Running, RunningCell, Topic
 from flangeye.models.scanners import ScannerData, detect_unit, median_distance
-from flangeye.models.urdf import MAX_BYTES, NAMED, UrdfArm, arm_of, flange_links, parse_urdf
+from flangeye.models.urdf import LINKS_NAMED, URDF_BYTES, UrdfArm, arm_of, flange_links, parse_urdf
 from flangeye.types import CAMERA, CalibratedPose, Floats, PointCloud
 from flangeye.types.geometry import (
     invert,
@@ -29,7 +29,7 @@ from flangeye.types.geometry import (
 )
 from flangeye_plugins.ros2.client import MATCHING, Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
-    PER_METRE,
+    DEPTH_UNITS,
     Type,
     cloud_of,
     decoded,
@@ -289,7 +289,7 @@ class Ros2Graph(Device):
         question = f"which robot_description ({', '.join(known) or 'none runs'}), or a .urdf file"
         chosen = ask("robot", question, known[0] if len(known) == 1 else None, "arm.urdf")
         if chosen not in known:
-            return read_text(Path(chosen), MAX_BYTES, DeviceError)
+            return read_text(Path(chosen), URDF_BYTES, DeviceError)
         self._bridge.follow(chosen, Type.TEXT)
         latched = self._bridge.wait(chosen, 0, self.counted)
         if latched is None:
@@ -385,7 +385,7 @@ class ReceivedTopic(NamedTuple):
         if self.newest is None:
             return "depth" if "depth" in name else "image"
         encoding = decoded(self.newest.data, Type.IMAGE).encoding
-        return "depth" if encoding in PER_METRE else "image"
+        return "depth" if encoding in DEPTH_UNITS else "image"
 
     @property
     def line(self) -> str:
@@ -416,7 +416,7 @@ def described_arm(text: str, path: Path, ask: Ask) -> tuple[UrdfArm, dict[str, A
     packages, urdf, flange = packages_of(text), parse_urdf(text, path), None
     links = flange_links(urdf)
     if len(links) > 1:  # of a gripper, or of a camera that the arm carries
-        question = f"which link is the flange, z outwards ({', '.join(links[:NAMED])})"
+        question = f"which link is the flange, z outwards ({', '.join(links[:LINKS_NAMED])})"
         flange = ask("flange", question, None, links[0])
     found = arm_of(urdf, flange=flange, packages=packages)
     section: dict[str, Any] = {"urdf": path.name, "base": found.base, "flange": found.flange}

@@ -36,11 +36,11 @@ class Type(StrEnum):
 
 SHORTEST = 12
 """A message with a time has four bytes of encapsulation, seconds and nanoseconds."""
-PIXELS = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
+PIXEL_TYPES = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "16UC1": ("u2", 1),
           "32FC1": ("f4", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3),
           "rgba8": ("u1", 4), "bgra8": ("u1", 4)}  # fmt: skip
 """Encodings of ``sensor_msgs/Image`` that are read: type and channels."""
-PER_METRE = {"16UC1": 1000.0, "mono16": 1000.0, "32FC1": 1.0}
+DEPTH_UNITS = {"16UC1": 1000.0, "mono16": 1000.0, "32FC1": 1.0}
 """Encodings of depth images: units in a metre (REP 118)."""
 
 
@@ -185,10 +185,10 @@ def values_of(message: Any) -> NDArray[Any]:
     Raises:
         StageError: The image's encoding is not known.
     """
-    if message.encoding not in PIXELS:
-        known = ", ".join(PIXELS)
+    if message.encoding not in PIXEL_TYPES:
+        known = ", ".join(PIXEL_TYPES)
         raise StageError(f"an image of encoding '{message.encoding}'; known: {known}")
-    name, channels = PIXELS[message.encoding]
+    name, channels = PIXEL_TYPES[message.encoding]
     kind = np.dtype((">" if message.is_bigendian else "<") + name)
     row = message.width * channels * kind.itemsize
     pixels = _rows_of(message, row, message.step).view(kind)

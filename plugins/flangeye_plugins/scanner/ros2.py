@@ -18,7 +18,7 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import Floats, Image
 from flangeye_plugins.ros2.client import Bridge, GraphMessage
 from flangeye_plugins.ros2.messages import (
-    PER_METRE,
+    DEPTH_UNITS,
     Type,
     cloud_of,
     decoded,
@@ -325,12 +325,12 @@ class Ros2Scanner(OpenScanner):
 
 def _metres(topic: str, message: Any) -> Floats:
     """Return the depths (H, W) of a depth image [m]; 0 where missing."""
-    if message.encoding not in PER_METRE:
-        known = ", ".join(PER_METRE)
+    if message.encoding not in DEPTH_UNITS:
+        known = ", ".join(DEPTH_UNITS)
         raise DeviceError(
             f"{NAME}: {topic} has the encoding {message.encoding}, depths have one of {known}"
         )
-    return np.nan_to_num(values_of(message) / PER_METRE[message.encoding], posinf=0.0, neginf=0.0)
+    return np.nan_to_num(values_of(message) / DEPTH_UNITS[message.encoding], posinf=0.0, neginf=0.0)
 
 
 def _running(bridge: Bridge, topic: str) -> Topic | None:

@@ -35,7 +35,7 @@ from flangeye_plugins.seam.points import normals_of
 from flangeye_plugins.seam.rough import Curve, JointPlace, Spline, course, rough_path
 from flangeye_plugins.seam.stitched import PlacedScan, seen_in_base
 from flangeye_plugins.seam.sweep import WIDE, Sweep, fitted, swept_from
-from flangeye_plugins.seam.template import EDGES, FACES, JOINTS, JointShape
+from flangeye_plugins.seam.template import EDGES, FACES, JOINT_SHAPES, JointShape
 
 STAGE = "seam.joint"
 
@@ -225,7 +225,7 @@ def _solid(points: Floats) -> tuple[float, Floats]:
 
 def _placed(rough: Curve, local: Floats, normals: Floats, params: JointParams) -> list[JointPlace]:
     """Return the joint's positions along the rough line, one per slab."""
-    joint = JOINTS[params.joint]
+    joint = JOINT_SHAPES[params.joint]
     joints: tuple[JointShape, ...] = (joint,)
     if joint.mirrored() != joint and params.joint != "fillet":
         joints = (joint, joint.mirrored())
@@ -351,7 +351,9 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
             raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm{name}")
     # Before the angles: on a single plane any joint's angles fit somehow.
     _refuse_plane(found)
-    leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(JOINTS[params.joint].spread)
+    leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(
+        JOINT_SHAPES[params.joint].spread
+    )
     if leaning.max() > 0:
         raise CalibrationRefused(
             f"{STAGE}: this is not a {params.joint} joint: an angle between its surfaces is off by "

@@ -17,9 +17,9 @@ from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.body.search import BodySearch, around
 
 STAGE = "seam.cad"
-LARGER, FEWEST = 3.0, 300
+LARGER, FEWEST_OF_PART = 3.0, 300
 """A part this many times larger than all of the scan, or with fewer points, has a wrong unit."""
-SAME = 1e-3
+SAME_SEAM = 1e-3
 """Poses whose seams differ by less than this count as the same [m]."""
 AROUND = 0.05
 """Smallest reach of the surface around a seam that must be seen, as a share of the diagonal."""
@@ -100,7 +100,7 @@ def register(
     # Candidates are sorted: the first one with another seam is the strongest rival.
     for other in found[1:]:
         apart = _seam_apart(seam, invert(fit.pose) @ other.pose, looks.size)
-        if apart > SAME:
+        if apart > SAME_SEAM:
             second = max(other.verdict.score / best, 0.0)
             if second > 1 - limits.distinct:
                 _refuse_ambiguous(fit.pose, other.pose, apart, second)
@@ -114,15 +114,15 @@ def check_unit(points: Floats, workpiece: Workpiece) -> None:
     Raises:
         StageError: The message names the unit that would fit.
     """
-    if len(points) < FEWEST:
-        raise StageError(f"{STAGE}: the scan has {len(points)} points; {FEWEST} are needed")
+    if len(points) < FEWEST_OF_PART:
+        raise StageError(f"{STAGE}: the scan has {len(points)} points; {FEWEST_OF_PART} are needed")
     sample = points[:: max(1, len(points) // 50_000)]
     # For points on a square: a part with FEWEST points is sqrt(FEWEST) spacings wide
     extent = float(np.linalg.norm(np.ptp(sample, axis=0)))
     spacing, size, unit = extent / np.sqrt(len(points)), workpiece.diagonal, workpiece.unit
     if size > LARGER * extent:
         what = f"{size / extent:.0f} times larger than all of the scan ({extent:.3g} m)"
-    elif size < np.sqrt(FEWEST) * spacing:
+    elif size < np.sqrt(FEWEST_OF_PART) * spacing:
         what = f"too small for the scan, whose points are about {spacing * 1e3:.2g} mm apart"
     else:
         return

@@ -15,7 +15,7 @@ from flangeye.types.geometry import arc_lengths, rows_at
 from flangeye_plugins.seam.planned import resampled
 from flangeye_plugins.seam.template import EDGES, FACES, OFFSETS, JointShape, Section
 
-BESIDE = 2e-3
+SLAB_ERROR = 2e-3
 """Standard deviation of a rough line's error from one slab to the next [m]."""
 
 
@@ -217,7 +217,7 @@ def _apart(places: list[JointPlace]) -> list[JointPlace]:
     """Return the best few distinct places."""
     kept: list[JointPlace] = []
     for place in sorted(places, key=lambda p: -p.score):
-        if all(np.linalg.norm(place.q - other.q) > BESIDE for other in kept):
+        if all(np.linalg.norm(place.q - other.q) > SLAB_ERROR for other in kept):
             kept.append(place)
         # At most six places per slab are kept
         if len(kept) == 6:
@@ -257,9 +257,9 @@ def _ways(spots: list[list[JointPlace]]) -> list[list[JointPlace]]:
 
 def _jump(first: JointPlace, second: JointPlace, slabs: int) -> float:
     # Random walk from slab to slab: squared steps divided by the number of slabs
-    away = np.linalg.norm(first.q - second.q) / BESIDE
+    away = np.linalg.norm(first.q - second.q) / SLAB_ERROR
     rolled = np.angle(np.exp(1j * (first.roll - second.roll))) / np.radians(8)
-    other = np.abs(first.shape[4:] - second.shape[4:]).max() / BESIDE
+    other = np.abs(first.shape[4:] - second.shape[4:]).max() / SLAB_ERROR
     return float(
         0.3 * (away**2 + rolled**2 + other**2) / slabs + 10 * (first.joint is not second.joint)
     )

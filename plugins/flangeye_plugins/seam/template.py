@@ -64,7 +64,7 @@ class JointShape:
         )
 
 
-JOINTS = {
+JOINT_SHAPES = {
     "vee": JointShape((0, 55, 0, -55), (0.5, 20, 0.5, 20), (True, True)),
     "bevel": JointShape((0, 90, 0, -48), (0.5, 1, 0.5, 12), (True, True), unseen=(1,)),
     "butt": JointShape((0, 90, 0, -90), (0.5, 1, 0.5, 1), gap=True, unseen=(1, 3)),

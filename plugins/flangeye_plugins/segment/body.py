@@ -78,7 +78,7 @@ def segment_body(
         StageError: The cloud's unit is wrong (for example millimetres), or a body of revolution is
             drawn in its carrier's frame with its axis along another one than z.
     """
-    from flangeye_plugins.body.dense import FEWEST
+    from flangeye_plugins.body.dense import FEWEST_ON_BODY
     from flangeye_plugins.body.looks import prepared
     from flangeye_plugins.body.search import BodySearch, alike, around
     from flangeye_plugins.segment.scale import check_scale
@@ -88,7 +88,7 @@ def segment_body(
     if len(points):
         check_scale(points, capture.id)
     points = _between(points, params.near, params.far)
-    if len(points) < FEWEST:
+    if len(points) < FEWEST_ON_BODY:
         return Rejected("no point between near and far")
     looks = prepared(body)
     freedoms, _, axis = looks.symmetry

@@ -141,9 +141,9 @@ def _normals(points: Floats, neighbours: int = 12) -> Floats:
     return np.asarray(np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1][:, :, 0])
 
 
-SIZE = 0.03
+FLANGE_RADIUS = 0.03
 """Radius of a flange [m]: brings rotations and translations to one scale."""
-STILL = 5e-6
+SMALLEST_STEP = 5e-6
 """Converged when no point moves further than this in one iteration [m]; near the end matches may
 go on changing to and fro between neighbours, a micrometre each time. Before the last limit a
 tenth of a millimetre is enough."""
@@ -188,7 +188,7 @@ def register(
     motion = np.eye(4)
     # Coarse to fine: a tight limit at the start would lose a plate that is off by more.
     for limit in _limits(reach, distance):
-        still = STILL if limit == distance else 20 * STILL
+        still = SMALLEST_STEP if limit == distance else 20 * SMALLEST_STEP
         converged = _converge(source, surface, motion, limit, still)
         if isinstance(converged, str):
             return converged
@@ -212,7 +212,7 @@ def _converge(
             return f"no points came within {limit * 1e3:g} mm of the flange's shape"
         step, unknown = _least_squares(jacobian, distances)
         motion = rigid(rotation_exp(step[:3]), step[3:]) @ motion
-        if np.abs(step[:3]).max() * SIZE + np.abs(step[3:]).max() < still:
+        if np.abs(step[:3]).max() * FLANGE_RADIUS + np.abs(step[3:]).max() < still:
             return motion, unknown
     return f"no convergence in {iterations} iterations"
 
@@ -235,7 +235,7 @@ def _equations(
 
 def _least_squares(jacobian: Floats, distances: Floats) -> tuple[Floats, Floats]:
     """Return the step (6,), zero along unobservable directions, and these directions (k, 6)."""
-    scale = np.array([SIZE] * 3 + [1.0] * 3)
+    scale = np.array([FLANGE_RADIUS] * 3 + [1.0] * 3)
     scaled = jacobian / scale
     values, vectors = np.linalg.eigh(scaled.T @ scaled / len(distances))
     # A motion is determined when it changes the distances by 3 % of itself or more, rms. Turning

@@ -9,7 +9,7 @@ from flangeye import StageError
 from flangeye.models.loading import load_model
 from flangeye.models.targets import flange_of, load_standard
 from flangeye_emulators.world.mesh import (
-    FINE,
+    SEGMENTS,
     box,
     capsule,
     circle,
@@ -34,7 +34,7 @@ def polygon(radius, segments):
 
 
 def test_a_measured_circle_is_round_to_a_micrometre() -> None:
-    inside = circle(50e-3, FINE)
+    inside = circle(50e-3, SEGMENTS)
     middles = (inside + np.roll(inside, 1, axis=0)) / 2
     assert 50e-3 - np.hypot(*middles.T).min() < 1e-6
 
@@ -55,7 +55,7 @@ def test_the_face_is_the_rim_less_bore_holes_and_recesses(robot: str) -> None:
     holes = len(shape.holes) * polygon(shape.hole, 120) + polygon(shape.pin_hole, 120)
     slots = [s.width**2 / 4 * np.pi + 2 * s.half_span * s.radius * s.width
              for s in shape.details.recesses]  # fmt: skip
-    wanted = polygon(shape.rim, FINE) - polygon(shape.bore, FINE) - holes - sum(slots)
+    wanted = polygon(shape.rim, SEGMENTS) - polygon(shape.bore, SEGMENTS) - holes - sum(slots)
     assert area(mesh, face) == pytest.approx(wanted, rel=3e-4)
 
 
@@ -99,7 +99,7 @@ def test_every_point_of_a_capsule_is_a_radius_from_its_axis(end: tuple[Any, ...]
 
 def test_box_disc_and_merging() -> None:
     both = merged([box([0, 0, 0], [1, 2, 3]), disc(1.0, 5.0)])
-    assert area(both) == pytest.approx(2 * (2 + 3 + 6) + polygon(1.0, FINE))
+    assert area(both) == pytest.approx(2 * (2 + 3 + 6) + polygon(1.0, SEGMENTS))
     assert both.triangles.max() == len(both.vertices) - 1
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from flangeye_plugins.robot.ur import worker
-from flangeye_plugins.robot.ur.worker import LOOK, SAMPLE, SIZE, Commander, Publisher
+from flangeye_plugins.robot.ur.worker import LOOK, SAMPLE, SHARED_SIZE, Commander, Publisher
 
 PLAYING = 2
 
@@ -89,7 +89,7 @@ class Cell:
         self.looks()
 
     def looks(self) -> None:
-        LOOK.pack_into(self.memory, SIZE, self.clock.now)
+        LOOK.pack_into(self.memory, SHARED_SIZE, self.clock.now)
 
     def done(self) -> list[tuple[Any, ...]]:
         """Return what the library was told since the last question."""
@@ -314,7 +314,7 @@ def published(cell: Cell, stamps: list[float], monkeypatch: pytest.MonkeyPatch) 
 
     def sleep(seconds: float) -> None:
         cell.clock.now += 0.01
-        raw = bytes(cell.memory[:SIZE])
+        raw = bytes(cell.memory[:SHARED_SIZE])
         body = raw[: SAMPLE.size]
         whole = struct.unpack("<I", raw[SAMPLE.size :])[0] == zlib.crc32(body)
         seen.append((round(seconds / 0.002, 3), SAMPLE.unpack(body) if whole else None))

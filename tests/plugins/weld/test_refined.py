@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.following.refined import LENGTHS, PRIOR, SIZES, RefinedPath, _Field
+from flangeye_plugins.weld.following.refined import CORRELATIONS, PRIOR, SIZES, RefinedPath, _Field
 from flangeye_plugins.weld.path import PATH_SPACING, Path
 from tests.plugins.weld.bench import curved, straight
 
@@ -52,7 +52,7 @@ def test_each_filter_is_the_dense_distribution_before_among_and_beyond_what_was_
         found.add(s, offset, 0.0)
     found.renew(-0.05, ALL)
     means, variances = found._each(at)
-    models = [(size, length) for size in SIZES for length in LENGTHS]
+    models = [(size, length) for size in SIZES for length in CORRELATIONS]
     for i, model in enumerate(models):
         mean, variance = dense(model, places, offsets, 30e-6, at)
         assert means[i] == pytest.approx(mean, abs=3e-6)

@@ -9,7 +9,7 @@ import pytest
 
 from flangeye.workflow.batch import cluster
 from flangeye.workflow.batch.cluster import Pace
-from flangeye.workflow.batch.dataset import BLOCK
+from flangeye.workflow.batch.dataset import FILE_SESSIONS
 from flangeye.workflow.batch.outcome import SessionOutcome, Status
 from flangeye.workflow.batch.work import Chunk, ChunkDone
 
@@ -40,7 +40,7 @@ def test_every_session_is_told_once_and_few_are_held(
     ) as client:
         found: list[str] = []
         for each in cluster.run_all(client, nothing, sessions(count), count):
-            assert len(client.futures) <= cluster.AHEAD + 1
+            assert len(client.futures) <= cluster.CHUNKS_AHEAD + 1
             found += [session for session, _ in each.bad]
     assert sorted(found) == [session.id for _, session in sessions(count)]
 
@@ -63,7 +63,7 @@ def told(seconds: float, count: int = 10) -> ChunkDone:
 @pytest.mark.parametrize(
     ("seconds", "workers", "size"),
     [
-        (0.0, 1, cluster.MOST),
+        (0.0, 1, cluster.CHUNK_SESSIONS),
         (0.05, 1, 100),  # five seconds of work
         (60.0, 1, 1),
         (0.05, 1000, 10),  # a half of what is left for each
@@ -79,12 +79,12 @@ def test_a_chunk_is_some_seconds_of_work(seconds: float, workers: int, size: int
 
 def test_chunks_get_shorter_towards_the_end_and_keep_to_their_block() -> None:
     client: Any = Workers(2)
-    pace = Pace(client, BLOCK + 100)
+    pace = Pace(client, FILE_SESSIONS + 100)
     pace.ended(told(0.001))
-    chunks: list[Chunk] = list(pace.cut(sessions(BLOCK + 100)))
+    chunks: list[Chunk] = list(pace.cut(sessions(FILE_SESSIONS + 100)))
     assert [chunk.block for chunk in chunks] == sorted(chunk.block for chunk in chunks)
     assert sum(len(c.sessions) for c in chunks if c.block == 1) == 100
-    assert len(chunks[0].sessions) == cluster.MOST and len(chunks[-1].sessions) == 1
+    assert len(chunks[0].sessions) == cluster.CHUNK_SESSIONS and len(chunks[-1].sessions) == 1
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from flangeye import types as t
 from flangeye.plugin.registry import Registry
-from flangeye.workflow.log.foxglove import CLOUDS, foxglove_layout, points_of
+from flangeye.workflow.log.foxglove import CLOUD_TOPICS, foxglove_layout, points_of
 from flangeye.workflow.log.record import Recorder
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.folder import RunFolder
@@ -33,7 +33,7 @@ def messages(toy_registry: Registry, tmp_path: Path) -> Any:
     found: dict[str, list[Any]] = {}
     with (tmp_path / "run.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, raw, message in reader.iter_decoded_messages(topics=list(CLOUDS)):
+        for _, channel, raw, message in reader.iter_decoded_messages(topics=list(CLOUD_TOPICS)):
             found.setdefault(channel.topic, []).append(message)
             assert raw.log_time > 0
     return found
@@ -60,7 +60,7 @@ def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path:
     assert flangeye("layout", "foxglove", "--out", tmp_path / "l.json")[0] == 0
     layout = json.loads((tmp_path / "l.json").read_text())
     shown = layout["configById"]["3D!cell"]["topics"]
-    assert set(CLOUDS) <= set(shown)
+    assert set(CLOUD_TOPICS) <= set(shown)
     named = json.dumps(layout["layout"])
     assert all(panel in named for panel in layout["configById"])
 
@@ -69,7 +69,7 @@ def test_foxgloves_own_classes_write_the_same_panels() -> None:
     """The maker's typed configurations know each setting by the name and the kind we write."""
     fox = pytest.importorskip("foxglove.layouts", reason="foxglove-sdk is not installed")
     clouds = {
-        t: fox.BaseRendererPointCloudTopicSettings(visible=True, point_size=2) for t in CLOUDS
+        t: fox.BaseRendererPointCloudTopicSettings(visible=True, point_size=2) for t in CLOUD_TOPICS
     }
     shapes = fox.BaseRendererSceneUpdateTopicSettings(visible=True)
     pose = fox.BaseRendererPoseTopicSettings(visible=True)

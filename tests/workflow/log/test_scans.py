@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from flangeye import types as t
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder
-from flangeye.workflow.log.records import BLOCK, pack, unpack
+from flangeye.workflow.log.records import POINTS_AT_ONCE, pack, unpack
 
 
 def scan(rows=300, columns=400):
@@ -26,7 +26,10 @@ def scan(rows=300, columns=400):
 
 
 @settings(max_examples=40)
-@given(arrays.arrays(np.uint32, st.integers(0, 40)), st.sampled_from([0, 1, BLOCK - 1, BLOCK]))
+@given(
+    arrays.arrays(np.uint32, st.integers(0, 40)),
+    st.sampled_from([0, 1, POINTS_AT_ONCE - 1, POINTS_AT_ONCE]),
+)
 def test_every_bit_comes_back(bits: Any, more: Any) -> None:
     flat = np.resize(bits, 3 * (len(bits) + more)).astype(np.uint32).view(np.float32)
     points = flat.reshape(-1, 3)

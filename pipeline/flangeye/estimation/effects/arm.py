@@ -22,7 +22,7 @@ from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, SmoothField
 from flangeye.types.geometry import hat
 
-KINDS = {
+ARM_ERRORS = {
     "zeros": ("joint zeros", 1.0),
     "encoders": ("encoder eccentricity", 0.2),
     "sag": ("sag", 1.0),
@@ -43,7 +43,7 @@ ACCURACY = 0.3e-3
 QUALITY = 4.0
 """Factor by which an arm may be better or worse than its file, one sigma. No data sheet states the
 accuracy of joints, and arms of one maker differ tenfold."""
-EACH = 1.8
+QUALITY_SPREAD = 1.8
 """Factor by which each kind may differ from the arm's common quality, one sigma."""
 
 
@@ -53,16 +53,16 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
     accuracy = carriers[0].accuracy or ACCURACY
     effects = []
     if _joints_of_all_known(problem, arm):
-        for kind, (name, ratio) in KINDS.items():
+        for kind, (name, ratio) in ARM_ERRORS.items():
             block = _of_carriers(arm, kind)
-            effects.append(Effect(name, block, ratio * accuracy, EACH, arm, True, kind))
+            effects.append(Effect(name, block, ratio * accuracy, QUALITY_SPREAD, arm, True, kind))
     else:
         effects += [
             Effect(
                 f"place of the {at}",
                 _in_common(arm, at == "base", rows),
                 size * accuracy,
-                EACH,
+                QUALITY_SPREAD,
                 arm,
                 True,
                 COMMON,
@@ -113,8 +113,8 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
         else:
             turns, shifts = (_anew(arm, rows) for rows in (slice(3), slice(3, 6)))
             turned, shifted = ANEW["each"]
-            out.append(Scatter(turns, turned * accuracy, EACH, arm))
-            out.append(Scatter(shifts, shifted * accuracy, EACH, arm))
+            out.append(Scatter(turns, turned * accuracy, QUALITY_SPREAD, arm))
+            out.append(Scatter(shifts, shifted * accuracy, QUALITY_SPREAD, arm))
     return out
 
 

@@ -8,7 +8,7 @@ from flangeye.estimation.effects.effect import Block, Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats, Mask
 
-SIZE = 1e-3
+PRINT_ERROR = 1e-3
 """Typical share by which a printed marker is larger or smaller than configured: a tenth of a
 millimetre of 100 mm, what a ruler shows."""
 
@@ -22,7 +22,7 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
             # The stated deviation comes from calibration views: 1.05 times as much, one sigma
             effects.append(Effect(name, _shared(camera), 1.0, 1.05, kind="shared"))
     # A tenth where the size is to be found
-    size = 0.1 if size_unknown else SIZE
+    size = 0.1 if size_unknown else PRINT_ERROR
     whole = {int(k) for k in s.pairs[s.ranks == 6]}
     pairs = [ends for k, ends in enumerate(problem.ends) if k in whole]
     for target in dict.fromkeys(target for _, target in pairs):
@@ -30,7 +30,7 @@ def camera_effects(problem: Problem, size_unknown: bool = False) -> list[Effect]
         effects.append(Effect(name, _size(target), size, kind="size"))
     for camera in dict.fromkeys(camera for camera, _ in pairs):
         name = f"focal length of {camera}"
-        effects.append(Effect(name, _focal(camera), SIZE, kind="focal", of_camera=True))
+        effects.append(Effect(name, _focal(camera), PRINT_ERROR, kind="focal", of_camera=True))
     return effects
 
 

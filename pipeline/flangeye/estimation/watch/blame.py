@@ -15,7 +15,7 @@ from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.types import Floats
 from flangeye.types.geometry import adjoint_shift, stack_rows
 
-LARGEST = 1e-3
+PART_CHANGE = 1e-3
 """Prior standard deviation of a part's change [rad] or [m]."""
 
 
@@ -84,17 +84,17 @@ def _designs(
     tool = np.concatenate([after.flanges, np.zeros((n, 2, 3))], axis=1)
     moved = stack_rows(at_scanner)
     found = {
-        "scanner turned": (moved[:, :3], np.full(3, LARGEST)),
-        "scanner shifted": (moved[:, 3:], np.full(3, LARGEST)),
-        "scanner moved": (moved, np.full(6, LARGEST)),
-        "flange replaced": (stack_rows(tool), np.full(3, LARGEST)),
+        "scanner turned": (moved[:, :3], np.full(3, PART_CHANGE)),
+        "scanner shifted": (moved[:, 3:], np.full(3, PART_CHANGE)),
+        "scanner moved": (moved, np.full(6, PART_CHANGE)),
+        "flange replaced": (stack_rows(tool), np.full(3, PART_CHANGE)),
     }
     if after.joints is None:
         return found
     k = after.joints.shape[2]
     columns = stack_rows(after.joints)
     # The first joint turns the base as the scanner would, so it is not a suspect of its own.
-    scale = np.full(k - 1, LARGEST)
+    scale = np.full(k - 1, PART_CHANGE)
     one = {f"joint {j + 1} re-mastered": (columns[:, [j]], scale[:1]) for j in range(1, k)}
     return found | one | {"arm re-mastered": (columns[:, 1:], scale)}
 

@@ -42,7 +42,7 @@ STATED = {
     "metre": 1.0, "inch": 1 / 0.0254, "in": 1 / 0.0254,
 }  # fmt: skip
 """Number of each unit in a metre, for the units that a heading may state."""
-WIDEST = 16
+POINT_NUMBERS = 16
 """Most numbers of one point: x, y, z, then normals, colours, intensity."""
 
 
@@ -106,16 +106,16 @@ def _axes_last(array: NDArray[Any]) -> NDArray[Any] | None:
 
 
 def _is_axes_first(shape: Shape) -> bool:
-    return len(shape) in (2, 3) and 3 <= shape[0] <= WIDEST < shape[-1]
+    return len(shape) in (2, 3) and 3 <= shape[0] <= POINT_NUMBERS < shape[-1]
 
 
 def _is_wide(shape: Shape) -> bool:
-    return len(shape) in (2, 3) and 3 <= shape[-1] <= WIDEST
+    return len(shape) in (2, 3) and 3 <= shape[-1] <= POINT_NUMBERS
 
 
 def _may_be_points(shape: Shape) -> bool:
     """Return whether an array of unknown name may be points, and not poses or a camera's matrix."""
-    rows = math.prod(shape[:-1]) > WIDEST and (len(shape) == 2 or shape[1] > 4)
+    rows = math.prod(shape[:-1]) > POINT_NUMBERS and (len(shape) == 2 or shape[1] > 4)
     return rows and shape[-1] in (3, 4, 6)
 
 

@@ -17,7 +17,7 @@ from flangeye.files.clouds.table import (
     split_header,
 )
 
-_TYPES = {
+_PLY_TYPES = {
     "char": "i1",
     "uchar": "u1",
     "short": "i2",
@@ -80,9 +80,9 @@ def _elements(path: Path, lines: list[list[str]]) -> list[_Element]:
 def _property(path: Path, words: list[str]) -> tuple[str, str]:
     if words[1:2] == ["list"]:
         return words[-1], ""
-    if len(words) != 3 or words[1] not in _TYPES:
+    if len(words) != 3 or words[1] not in _PLY_TYPES:
         refuse(path, f"its header has a property it cannot have: '{' '.join(words)}'")
-    return words[2], _TYPES[words[1]]
+    return words[2], _PLY_TYPES[words[1]]
 
 
 def _text(path: Path, offset: int, elements: list[_Element], at: int) -> TextTable:

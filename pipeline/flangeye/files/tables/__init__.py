@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.documents import KINDS, document_of, stacked
+from flangeye.files.documents import DOCUMENT_READERS, document_of, stacked
 from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import read_any_text
 from flangeye.files.scans import natural, partners
@@ -45,7 +45,7 @@ from flangeye.files.words import reason_of
 from flangeye.types.pose_formats import CONVENTIONS
 
 __all__ = [
-    "KINDS",
+    "DOCUMENT_READERS",
     "Cell",
     "Column",
     "Table",

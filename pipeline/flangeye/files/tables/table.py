@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.documents import MATRICES, TableDocument
+from flangeye.files.documents import MATRIX_SHAPES, TableDocument
 from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.words import nearest
 from flangeye.types import Floats
@@ -151,7 +151,7 @@ def number_of(cell: Cell) -> float | None:
         return None
 
 
-WIDEST = 1000
+RECORD_VALUES = 1000
 """Most values of a record; one with more holds a scan."""
 SCAN = "name"
 """Column for the names under which records are stored."""
@@ -173,7 +173,7 @@ def rows_of(file: Path, document: TableDocument) -> list[Rows]:
     if isinstance(data, np.ndarray):
         if data.ndim == 0:
             raise StageError(f"{file}: is one number, expected rows of them")
-        one = data.shape in MATRICES or data.ndim == 1
+        one = data.shape in MATRIX_SHAPES or data.ndim == 1
         return [_columns(document.where, {"": data[None] if one else data})]
     if isinstance(data, list):
         return [table_of([(document.where(at), record) for at, record in enumerate(data)])]
@@ -217,9 +217,9 @@ def _is_record(value: Any) -> bool:
         return True
     shape = _shape(value)
     # Three or four numbers are a position or a rotation, six and more a whole pose
-    return shape in MATRICES or (len(shape) == 1 and shape[0] in (3, 4, 6, 7, 12, 16)) or shape in (
-        (3, 1), (4, 1), (6, 1), (1, 3), (1, 6)
-    )  # fmt: skip
+    row = len(shape) == 1 and shape[0] in (3, 4, 6, 7, 12, 16)
+    column = shape in ((3, 1), (4, 1), (6, 1), (1, 3), (1, 6))
+    return shape in MATRIX_SHAPES or row or column
 
 
 def _shape(value: Any) -> tuple[int, ...]:
@@ -244,7 +244,8 @@ def _side_by_side(where: Callable[[int], str], data: Mapping[str, Any]) -> list[
     stacks = Counter(
         len(value)
         for value in lists.values()
-        if len(_shape(value)) > 2 or (len(_shape(value)) == 2 and _shape(value) not in MATRICES)
+        if len(_shape(value)) > 2
+        or (len(_shape(value)) == 2 and _shape(value) not in MATRIX_SHAPES)
         or _are_records(value)
     )  # fmt: skip
     found = []
@@ -274,7 +275,7 @@ def _columns(where: Callable[[int], str], lists: Mapping[str, Any]) -> Rows:
         shape = _shape(value)
         if shape:
             array = np.asarray(value, dtype=np.float64)
-            if 0 < array.size <= len(array) * WIDEST:
+            if 0 < array.size <= len(array) * RECORD_VALUES:
                 flat = array.reshape(len(array), -1)
                 for i, index in enumerate(np.ndindex(*shape[1:])):
                     columns[".".join(filter(None, (name, *map(str, index))))] = flat[:, i].tolist()
@@ -315,8 +316,8 @@ def _heading(columns: Sequence[str]) -> tuple[str, ...]:
 def _cells(where: str, record: Any) -> dict[str, Cell]:
     found: dict[str, Cell] = {}
     for name, value in _leaves(record):
-        if len(found) == WIDEST:
-            raise StageError(f"{where}: has more than {WIDEST} values, too many for a pose")
+        if len(found) == RECORD_VALUES:
+            raise StageError(f"{where}: has more than {RECORD_VALUES} values, too many for a pose")
         number = isinstance(value, int | float) and not isinstance(value, bool)
         found[name] = value if number else "" if value is None else str(value)
     return found

@@ -23,7 +23,7 @@ import numpy as np
 
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import keep_current_folder_out, python_command, require_memory
-from flangeye.workflow.batch.dataset import BLOCK
+from flangeye.workflow.batch.dataset import FILE_SESSIONS
 from flangeye.workflow.batch.outcome import BatchError, SessionOutcome, Tls
 from flangeye.workflow.batch.plan import BatchSession
 from flangeye.workflow.batch.work import WORKER_DIED, Chunk, ChunkDone, Job, run_chunk, write_rows
@@ -38,10 +38,10 @@ PREFIX = "flangeye-batch-"
 CONNECT_SECONDS = 5.0
 """Longest wait for a scheduler that was given by address."""
 
-AHEAD = 3
+CHUNKS_AHEAD = 3
 """Chunks that the scheduler is to know of for each worker."""
 
-CHUNK_SECONDS, MOST = 5.0, 500
+CHUNK_SECONDS, CHUNK_SESSIONS = 5.0, 500
 """Target duration of a chunk [s], and its largest number of sessions."""
 
 
@@ -273,12 +273,12 @@ class Pace:
         if not self._ended:
             return 1
         mean = max(self._seconds / self._ended, 1e-6)
-        wanted = min(CHUNK_SECONDS / mean, self._left / (2 * self.workers()), MOST)
+        wanted = min(CHUNK_SECONDS / mean, self._left / (2 * self.workers()), CHUNK_SESSIONS)
         return max(1, int(wanted))
 
     def asks(self, chunks: int, sessions: int, share: float = 1.0) -> bool:
         """Return whether to submit more sessions than these; ``share`` scales the limits."""
-        if chunks < share * AHEAD * self.workers():
+        if chunks < share * CHUNKS_AHEAD * self.workers():
             return True
         # Sessions that a scheduler elsewhere is to know of at least: its workers may only be
         # starting
@@ -286,7 +286,7 @@ class Pace:
 
     def cut(self, sessions: Iterable[tuple[int, BatchSession]]) -> Iterator[Chunk]:
         """Yield chunks on demand, each of the size that is then right."""
-        for block, members in groupby(sessions, key=lambda each: each[0] // BLOCK):
+        for block, members in groupby(sessions, key=lambda each: each[0] // FILE_SESSIONS):
             while some := [session for _, session in islice(members, self.size())]:
                 self._left -= len(some)
                 yield Chunk(block, some)

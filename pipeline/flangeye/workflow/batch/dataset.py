@@ -29,7 +29,7 @@ Kind = str
 """``string``, ``int64`` or ``double``, as Arrow calls them."""
 
 FOLDER = "sessions.parquet"
-BLOCK = 10_000
+FILE_SESSIONS = 10_000
 """Sessions in a file at most."""
 
 
@@ -158,7 +158,7 @@ class Dataset:
 
         table = pa.concat_tables([self._schema.empty_table(), *map(self._read, parts)])
         at = ledger.positions(table["session"].to_pylist())
-        counts = (at >= 0) & (at // BLOCK == block)
+        counts = (at >= 0) & (at // FILE_SESSIONS == block)
         if statuses:
             counts &= pc.is_in(table["status"], pa.array(statuses)).to_numpy()
         if report:

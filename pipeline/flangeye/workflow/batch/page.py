@@ -40,7 +40,7 @@ _HEADINGS: Mapping[str, str] = {
 }
 
 
-COLOURS = (
+PALETTE = (
     "#3a7ebf", "#d9822b", "#3f9b57", "#b8485f", "#7d62b5", "#8a6d3b", "#c06fa8", "#5b6474",
 )  # fmt: skip
 """Distinct on white and on black; a second varied parameter has at most this many values."""
@@ -185,7 +185,7 @@ def _axes(rows: Sequence[Row], varied: Sequence[str]) -> tuple[str, str | None]:
     if not varying:
         return "seed", None
     second = varying[1] if len(varying) > 1 else None
-    return varying[0], second if second and distinct[second] <= len(COLOURS) else None
+    return varying[0], second if second and distinct[second] <= len(PALETTE) else None
 
 
 def _drawing(rows: Sequence[Row], figure: Figure, x: str, colour: str | None) -> Drawing:
@@ -194,7 +194,7 @@ def _drawing(rows: Sequence[Row], figure: Figure, x: str, colour: str | None) ->
     for i, row in enumerate(rows):
         groups.setdefault(str(row[colour]) if colour else "", []).append(i)
     traces = []
-    for (group, members), shade in zip(groups.items(), itertools.cycle(COLOURS), strict=False):
+    for (group, members), shade in zip(groups.items(), itertools.cycle(PALETTE), strict=False):
         at = [places[i] for i in members]
         y = [rows[i][figure.column] * figure.scale for i in members]
         names = [rows[i]["session"] for i in members]

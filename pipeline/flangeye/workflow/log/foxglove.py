@@ -161,7 +161,7 @@ def _set_pose(position: Any, orientation: Any, transform: Transform) -> None:
     orientation.x, orientation.y, orientation.z, orientation.w = x, y, z, w
 
 
-CLOUDS = ("/capture/cloud", "/circle", "/base/flanges")
+CLOUD_TOPICS = ("/capture/cloud", "/circle", "/base/flanges")
 
 
 def foxglove_layout() -> str:
@@ -169,7 +169,7 @@ def foxglove_layout() -> str:
     panels: dict[str, Any] = {
         "3D!cell": {
             "followTf": "base",
-            "topics": {topic: {"visible": True, "pointSize": 2} for topic in CLOUDS}
+            "topics": {topic: {"visible": True, "pointSize": 2} for topic in CLOUD_TOPICS}
             | {"/scene": {"visible": True}, "/seam": {"visible": True}, "/pose": {"visible": True}},
         },
         "Image!camera": {"imageMode": {"imageTopic": "/capture/image"}},

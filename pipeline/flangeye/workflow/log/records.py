@@ -43,10 +43,10 @@ HASHES = "flangeye.sha256"
 """Name of the metadata record that says an attachment's hash."""
 
 
-BLOCK = 2048
+POINTS_AT_ONCE = 2048
 """Points turned over at once: they fit the processor's nearest memory."""
 
-WIDTH = 12
+POINT_BYTES = 12
 """Bytes of a point."""
 
 
@@ -305,7 +305,7 @@ def pack(xyz: Singles) -> bytes:
 
     points = np.ascontiguousarray(xyz, dtype="<f4").reshape(-1, 3).view(np.uint8)
     # of zstandard: the fast levels lose three hundredths of the size
-    return zstandard.compress(_turned(points, (BLOCK, WIDTH)).data, level=-8)
+    return zstandard.compress(_turned(points, (POINTS_AT_ONCE, POINT_BYTES)).data, level=-8)
 
 
 def unpack(packed: bytes, shape: Sequence[int]) -> Singles | None:
@@ -320,20 +320,24 @@ def unpack(packed: bytes, shape: Sequence[int]) -> Singles | None:
         planes = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
     except zstandard.ZstdError:
         return None
-    if len(planes) != size or size % WIDTH:
+    if len(planes) != size or size % POINT_BYTES:
         return None
-    return _turned(np.frombuffer(planes, np.uint8), (WIDTH, BLOCK)).view("<f4").reshape(shape)
+    return (
+        _turned(np.frombuffer(planes, np.uint8), (POINT_BYTES, POINTS_AT_ONCE))
+        .view("<f4")
+        .reshape(shape)
+    )
 
 
 def _turned(flat: Bytes, block: tuple[int, int]) -> Bytes:
     """Return each block of bytes, and the shorter rest, with rows and columns exchanged."""
     flat, out = flat.reshape(-1), np.empty(flat.size, dtype=np.uint8)
-    whole = len(flat) // (BLOCK * WIDTH) * BLOCK * WIDTH
+    whole = len(flat) // (POINTS_AT_ONCE * POINT_BYTES) * POINTS_AT_ONCE * POINT_BYTES
     rows, columns = block
     out[:whole].reshape(-1, columns, rows)[:] = (
         flat[:whole].reshape(-1, rows, columns).transpose(0, 2, 1)
     )
-    rest = (len(flat) - whole) // WIDTH
-    rows, columns = (rest if side == BLOCK else side for side in block)
+    rest = (len(flat) - whole) // POINT_BYTES
+    rows, columns = (rest if side == POINTS_AT_ONCE else side for side in block)
     out[whole:].reshape(columns, rows)[:] = flat[whole:].reshape(rows, columns).T
     return out

@@ -17,7 +17,7 @@ from flangeye.devices import MotionAllowed
 from flangeye.errors import RecipeError
 from flangeye.files.regular import read_text
 from flangeye.files.validation import sentence
-from flangeye.files.yaml_lines import MAX_BYTES, Document, dumped, parse_yaml, read_yaml
+from flangeye.files.yaml_lines import YAML_BYTES, Document, dumped, parse_yaml, read_yaml
 from flangeye.models.boards import Board
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.registry import Lookup, PluginNotFoundError, Registry
@@ -117,7 +117,7 @@ def load_recipe(path: Path, registry: Registry, overrides: Sequence[str] = ()) -
     """
     document = read_yaml(path)
     return _Checker(document, Lookup(registry, path.parent.absolute(), needs_files=True)).check(
-        path.stem, read_text(path, MAX_BYTES, RecipeError), overrides
+        path.stem, read_text(path, YAML_BYTES, RecipeError), overrides
     )
 
 

@@ -40,7 +40,7 @@ from flangeye.workflow.report.plot import (
 from flangeye.workflow.report.space import PlotlyFigure, in_words, mapped, target_centres
 from flangeye.workflow.report.units import millimetres, percent
 
-AXES = 0.2
+AXES_LENGTH = 0.2
 """Length of the axes of base and camera [m]."""
 
 
@@ -82,9 +82,9 @@ def cell_drawing(facts: Facts) -> PlotlyFigure | None:
     if box := facts.result.workspace:
         edges = box_edges(np.array(box.centre), np.array(box.size))
         traces.append(lines(edges, SERIES["held_out"], 2, name="workspace"))
-    traces += frame(np.eye(4), carrier, AXES)
+    traces += frame(np.eye(4), carrier, AXES_LENGTH)
     if pose is not None:
-        traces += frame(pose, t.CAMERA, AXES)
+        traces += frame(pose, t.CAMERA, AXES_LENGTH)
     return _drawing(traces, shown, in_words(carrier))
 
 
@@ -121,9 +121,9 @@ def _from_each(facts: Facts, poses: Floats, words: str) -> PlotlyFigure:
         *(_body(body, at[body.capture]) if body else ()),
     ]
     first = {x: at[body.capture] if body else poses[rows[0]] for x, rows in by_camera.items()}
-    axes = [trace for name, pose in first.items() for trace in frame(pose, name, AXES / 2)]
+    axes = [trace for name, pose in first.items() for trace in frame(pose, name, AXES_LENGTH / 2)]
     shown = list(dict.fromkeys(str(x["name"]) for x in drawn))
-    return _drawing([*drawn, *frame(np.eye(4), t.BASE, AXES), *axes], shown, words)
+    return _drawing([*drawn, *frame(np.eye(4), t.BASE, AXES_LENGTH), *axes], shown, words)
 
 
 def _rows(names: list[str]) -> dict[str, list[int]]:

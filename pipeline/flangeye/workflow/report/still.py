@@ -20,7 +20,7 @@ from flangeye.workflow.report.look import SERIES
 
 AZIMUTH, ELEVATION = np.radians(-62.0), np.radians(20.0)
 """Where the picture is taken from, about the base: it shows an arm that reaches along x."""
-PIXELS = 'vector-effect="non-scaling-stroke"'
+LINE_IN_PIXELS = 'vector-effect="non-scaling-stroke"'
 """Attribute that keeps a line's width in pixels at any scale of the picture."""
 
 
@@ -135,7 +135,7 @@ def _floor(corners: Floats) -> Iterable[_Line]:
         for n in range(low[axis], high[axis] + 1):
             ends = np.zeros((2, 3))
             ends[:, axis], ends[:, 1 - axis] = n, (low[1 - axis], high[1 - axis])
-            lines.append(_Line(square * ends, "var(--grid, #9aa4b4)", 1.0, PIXELS))
+            lines.append(_Line(square * ends, "var(--grid, #9aa4b4)", 1.0, LINE_IN_PIXELS))
     for axis, colour in enumerate((SERIES["x"], SERIES["y"], SERIES["z"])):
         tip = np.zeros((2, 3))
         tip[1, axis] = square
@@ -186,8 +186,8 @@ def _seen(scene: StillScene) -> list[_Line]:
     at = np.eye(4) if scene.base_T_camera is None else scene.base_T_camera
     near, far = frustum(scene.scanner, at)
     rays = [np.stack([at[:3, 3], corner]) for corner in far[:4]]
-    edges = [_Line(line, SERIES["used"], 1.5, PIXELS) for line in (near, far, *rays)]
-    return [*edges, _Line(np.stack([at[:3, 3]] * 2), SERIES["used"], 9.0, PIXELS)]
+    edges = [_Line(line, SERIES["used"], 1.5, LINE_IN_PIXELS) for line in (near, far, *rays)]
+    return [*edges, _Line(np.stack([at[:3, 3]] * 2), SERIES["used"], 9.0, LINE_IN_PIXELS)]
 
 
 def frustum(scanner: ScannerModel, base_T_camera: Floats) -> tuple[Floats, Floats]:
@@ -210,7 +210,7 @@ def _kept(scene: StillScene) -> list[_Line]:
     signs = [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]
     rims = [np.column_stack([np.array(signs), np.full(5, z)]) * size / 2 + centre for z in (-1, 1)]
     posts = [np.stack(pair) for pair in zip(*(rim[:4] for rim in rims), strict=True)]
-    dashed = f'{PIXELS} stroke-dasharray="4 4"'
+    dashed = f'{LINE_IN_PIXELS} stroke-dasharray="4 4"'
     return [_Line(line, "var(--unverified, #d98a00)", 1.0, dashed) for line in [*rims, *posts]]
 
 

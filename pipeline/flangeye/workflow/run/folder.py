@@ -24,7 +24,7 @@ from flangeye.workflow.result.contract import AnswerResult, Result, TransformRes
 
 RUNS = Path("runs")
 """Where the folders of runs go, unless one is named."""
-CHECKS = "checks"
+CHECKS_FOLDER = "checks"
 """Where beside a calibration the scans of its checks go."""
 
 
@@ -99,7 +99,7 @@ class RunFolder:
         with suppress(OSError):  # somebody else put something there
             self.log.unlink(missing_ok=True)
             self.path.rmdir()
-            if self.path.parent.name in (RUNS.name, CHECKS):
+            if self.path.parent.name in (RUNS.name, CHECKS_FOLDER):
                 self.path.parent.rmdir()
 
     def _write(self, name: str, text: str) -> None:

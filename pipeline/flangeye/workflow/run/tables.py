@@ -24,7 +24,7 @@ from flangeye.workflow.recipe.load import Recipe
 from flangeye.workflow.result import SIMULATED
 from flangeye.workflow.run.folder import recipe_of_log
 
-POSE = ("number", "x", "y", "z", "qx", "qy", "qz", "qw")
+POSE_COLUMNS = ("number", "x", "y", "z", "qx", "qy", "qz", "qw")
 WRITTEN: Mapping[str, Any] = {"number": "number", "rotation": "xyzw", "length": "m"}
 """How the tables' poses are written, as ``reader.cell`` takes it."""
 
@@ -95,7 +95,7 @@ def _number(observation: Observation) -> str:
 
 def _moved(name: str, cell: Cell, seen: Sequence[Observation]) -> Iterator[Sequence[Any]]:
     mover = cell.movers[name]
-    yield ("number", "value") if isinstance(mover, Axis) else (*POSE, *_joints(name, seen))
+    yield ("number", "value") if isinstance(mover, Axis) else (*POSE_COLUMNS, *_joints(name, seen))
     moments = {_number(o): o for o in seen}
     for number in sorted(moments, key=lambda number: (len(number), number)):
         pose, joints = moments[number].poses[name], moments[number].arm_joints.get(name, ())
@@ -113,7 +113,7 @@ def _seen(seen: Sequence[Observation], scans: Mapping[str, str]) -> Iterator[Seq
         yield from ((_number(o), scans[o.id]) for o in seen)
         return
     whole = isinstance(seen[0].feature, PoseFeature)
-    yield POSE if whole else POSE[:4]
+    yield POSE_COLUMNS if whole else POSE_COLUMNS[:4]
     for o in seen:
         feature = o.feature
         if isinstance(feature, PoseFeature):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from flangeye_emulators.controllers.network import Connection, Network
 from flangeye_emulators.controllers.ur.controller import Registers, RobotMode, Runtime, URController
 
-FORMATS = {
+RTDE_TYPES = {
     "BOOL": "?",
     "UINT8": "B",
     "UINT32": "I",
@@ -163,7 +163,7 @@ def write_inputs(box: URController, values: dict[str, float]) -> None:
             box.digital_outputs = (box.digital_outputs & ~mask) | (bits & mask)
 
 
-PORT = 30004
+RTDE_PORT = 30004
 
 _HEADER = struct.Struct(">HB")
 
@@ -175,7 +175,7 @@ class RtdePort:
         self._network = network
         self.box = box
         self.sessions: set[RtdeSession] = set()
-        network.offer(PORT, lambda: RtdeSession(network, self))
+        network.offer(RTDE_PORT, lambda: RtdeSession(network, self))
 
     def publish(self, cycle: int) -> None:
         """Send this control cycle's data package to every session."""
@@ -318,7 +318,7 @@ class OutputRecipe:
         self.valid = "NOT_FOUND" not in self.types
         if self.valid:
             self._values = [OUTPUTS[name].values for name in names]
-            self._packing = struct.Struct(">B" + "".join(FORMATS[t] for t in self.types))
+            self._packing = struct.Struct(">B" + "".join(RTDE_TYPES[t] for t in self.types))
 
     def pack(self, box: URController) -> bytes:
         """Return the body of one data package."""
@@ -343,13 +343,13 @@ class InputRecipe:
         self.types = [INPUTS.get(name, "NOT_FOUND") for name in names]
         self.valid = "NOT_FOUND" not in self.types
         if self.valid:
-            self._packing = struct.Struct(">" + "".join(FORMATS[t] for t in self.types))
+            self._packing = struct.Struct(">" + "".join(RTDE_TYPES[t] for t in self.types))
             # A vector has no effect on this controller: its first number stands for it.
             self._places = []
             place = 0
             for type_ in self.types:
                 self._places.append(place)
-                place += len(struct.unpack(f">{FORMATS[type_]}", bytes(_size(type_))))
+                place += len(struct.unpack(f">{RTDE_TYPES[type_]}", bytes(_size(type_))))
 
     def apply(self, body: bytes, box: URController) -> None:
         """Apply a data package; one that is too short is dropped.
@@ -362,4 +362,4 @@ class InputRecipe:
 
 
 def _size(type_: str) -> int:
-    return struct.calcsize(f">{FORMATS[type_]}")
+    return struct.calcsize(f">{RTDE_TYPES[type_]}")

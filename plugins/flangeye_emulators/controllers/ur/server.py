@@ -18,7 +18,7 @@ from flangeye_emulators.controllers.ur import rtde
 from flangeye_emulators.controllers.ur.controller import RefusedError, Runtime, URController
 from flangeye_emulators.controllers.ur.script import run_program, take_program
 
-PORT = 29999
+DASHBOARD_PORT = 29999
 
 Answer = Callable[[URController], str]
 
@@ -45,7 +45,7 @@ class DashboardSession(LineConnection):
 
 def answer(box: URController, text: str) -> str:
     """Execute one command and return its answer."""
-    act = ANSWERS.get(text.lower())
+    act = DASHBOARD.get(text.lower())
     if act is None:
         return f"could not understand: '{text}'"
     try:
@@ -70,7 +70,7 @@ def _version(box: URController) -> str:
     return f"URSoftware {'.'.join(map(str, box.box.version))} (loopback)"
 
 
-ANSWERS: dict[str, Answer] = {
+DASHBOARD: dict[str, Answer] = {
     "polyscopeversion": _version,
     "get serial number": lambda box: "20245500001",
     "get robot model": lambda box: box.robot.model.rstrip("e").upper(),
@@ -144,6 +144,6 @@ def serve(options: EmulatorOptions) -> None:
     stream = rtde.RtdePort(network, box)
     script = 30003
     network.offer(script, lambda: ScriptSession(network, box))
-    network.offer(PORT, lambda: DashboardSession(network, box))
-    ports = {"RTDE": rtde.PORT, "script": script, "dashboard": PORT}
+    network.offer(DASHBOARD_PORT, lambda: DashboardSession(network, box))
+    ports = {"RTDE": rtde.RTDE_PORT, "script": script, "dashboard": DASHBOARD_PORT}
     run_server(Server(options, box, network, URFaultInjector(box, network), ports), stream.publish)

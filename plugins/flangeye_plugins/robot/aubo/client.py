@@ -14,7 +14,7 @@ from flangeye.types import Floats
 Answer = TypeVar("Answer")
 
 
-STANDING = 2e-3
+STANDSTILL = 2e-3
 """A joint that is slower than this stands [rad/s]."""
 
 
@@ -164,7 +164,7 @@ class VelocityMove:
         """
         now = time.monotonic()
         passed, self._renewed = now - self._renewed, now
-        if self._velocity == 0.0 and fastest > STANDING:
+        if self._velocity == 0.0 and fastest > STANDSTILL:
             return  # it comes to rest first
         # From here on the controller moves to the goal itself [rad, m]: an arm at 0.5 rad/s^2 needs
         # 0.13 s for it, so that this end, too, is a piece.

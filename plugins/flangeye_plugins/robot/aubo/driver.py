@@ -15,7 +15,7 @@ from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
 from flangeye.types.geometry import rotation_log
 from flangeye.types.pose_formats import CONVENTIONS
-from flangeye_plugins.robot.aubo.client import STANDING, AuboClient, VelocityMove
+from flangeye_plugins.robot.aubo.client import STANDSTILL, AuboClient, VelocityMove
 from flangeye_plugins.robot.tool_check import (
     ControllerParams,
     require_model,
@@ -291,7 +291,7 @@ class AuboRobot(Device):
         power = self._ask("robot mode", tell.getRobotModeType).name
         if power != "Running":
             return "not ready", f"the arm is in mode {power}: switch it on at the pendant"
-        moves = self._under_way() or bool(np.abs(speeds).max() > STANDING)
+        moves = self._under_way() or bool(np.abs(speeds).max() > STANDSTILL)
         return ("moving" if moves else "ready"), ""
 
     def _under_way(self) -> bool:

@@ -22,12 +22,12 @@ from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats
 from flangeye.types.geometry import rotation_exp, rotation_log
 
-AHEAD = 0.1
+LEAD_TIME = 0.1
 """How far a piece leads along the motion before it brakes [s]: three renewals may be late."""
 
 STOPPING = 0.2
-"""Longest time in which a piece comes to rest after that [s]. With :data:`AHEAD`, and a tenth of a
-second for the controller, an arm that nobody leads any more stands within half a second."""
+"""Longest time in which a piece comes to rest after that [s]. With :data:`LEAD_TIME`, and a tenth
+of a second for the controller, an arm that nobody leads any more stands within half a second."""
 
 BEHIND = 0.2
 """Time before now at which a piece's points begin [s]: more than clock error and message delay."""
@@ -110,11 +110,11 @@ class DrivenPath(DrivenMotion):
     def __init__(self, joints: Floats, acceleration: float) -> None:
         """Follow joint angles (N, n) :data:`SAMPLE_TIME` apart, with a braking rate [rad/s^2].
 
-        Changes of speed are smoothed over :data:`AHEAD`, because the controller's cubic
+        Changes of speed are smoothed over :data:`LEAD_TIME`, because the controller's cubic
         interpolation across a step of speed would exceed both speeds.
         """
         super().__init__()
-        width = round(AHEAD / SAMPLE_TIME)
+        width = round(LEAD_TIME / SAMPLE_TIME)
         padded = np.pad(joints, ((width, width), (0, 0)), mode="edge")
         self._joints = sliding_window_view(padded, width + 1, axis=0).mean(axis=-1)
         self._speeds = np.gradient(self._joints, SAMPLE_TIME, axis=0)
@@ -165,9 +165,11 @@ class DrivenPath(DrivenMotion):
     def _ahead(self) -> list[Point]:
         left = max(self._end - self._phase, LAST)
         knots = [
-            self.knot * i for i in range(1, round(AHEAD / self.knot) + 1) if self.knot * i < left
+            self.knot * i
+            for i in range(1, round(LEAD_TIME / self.knot) + 1)
+            if self.knot * i < left
         ]
-        if left <= AHEAD:
+        if left <= LEAD_TIME:
             knots = [*(knot for knot in knots if left - knot > SAMPLE_TIME), left]
         return [self._point(after) for after in knots]
 

@@ -27,7 +27,7 @@ from flangeye_plugins.robot.ur import driver
 from flangeye_plugins.robot.ur.link import ControllerLink, CycleSample
 from flangeye_plugins.robot.ur.worker import ask_dashboard, read_remote
 
-PATIENCE = 0.5
+ANSWER_TIMEOUT = 0.5
 """Longest wait for one answer [s]."""
 
 
@@ -80,7 +80,7 @@ def facts_of(name: str, host: str, to_drive: bool = True) -> DashboardFacts:
         DeviceError: The controller does not answer or is not ready, or the network is too slow.
     """
     try:
-        with ask_dashboard(host, PATIENCE) as ask:
+        with ask_dashboard(host, ANSWER_TIMEOUT) as ask:
             asked = ("PolyscopeVersion", "safetymode", "robotmode", "is in remote control")
             said, trips = zip(*(_timed(ask, question) for question in asked), strict=True)
     except OSError as error:
@@ -104,7 +104,7 @@ def stop(host: str) -> None:
     Raises:
         OSError: The dashboard does not answer.
     """
-    with ask_dashboard(host, PATIENCE) as ask:
+    with ask_dashboard(host, ANSWER_TIMEOUT) as ask:
         ask("stop")
 
 
@@ -133,7 +133,7 @@ def _trouble(safety: str, power: str, remote: str, trip: float) -> str:
 
 def _reason(error: OSError) -> str:
     if isinstance(error, TimeoutError):
-        return f"nothing within {PATIENCE:g} s"
+        return f"nothing within {ANSWER_TIMEOUT:g} s"
     return error.strerror or str(error)
 
 

@@ -111,7 +111,7 @@ class ControllerLink:
         if self._gone:
             raise DeviceError(self._gone)
         for _ in range(100):
-            raw = self._memory[: worker.SIZE]
+            raw = self._memory[: worker.SHARED_SIZE]
             body = raw[: worker.SAMPLE.size]
             if struct.unpack("<I", raw[worker.SAMPLE.size :])[0] == zlib.crc32(body):
                 return _sample_of(body)
@@ -119,7 +119,7 @@ class ControllerLink:
 
     def look(self) -> None:
         """Renew the watchdog, without which a motion ends."""
-        worker.LOOK.pack_into(self._memory, worker.SIZE, time.monotonic())
+        worker.LOOK.pack_into(self._memory, worker.SHARED_SIZE, time.monotonic())
 
     def request(self, what: str, **arguments: Any) -> Any:
         """Send a call to the library's process, and return its result.
@@ -172,7 +172,7 @@ class ControllerLink:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(LEAVING)
         code = self._process.returncode
-        if code == worker.LOST:
+        if code == worker.CONNECTION_LOST:
             return "is lost: its connection broke"
         why = signal.Signals(-code).name if code and code < 0 else f"exit code {code}"
         return f"is lost: its client process ended ({why})"

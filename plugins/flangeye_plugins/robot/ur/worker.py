@@ -30,13 +30,13 @@ SAMPLE = struct.Struct("<2q5i24d")
 remote, 0 local, -1 not known), busy; joints, joint speeds, tool pose, tool force. Behind it, a
 CRC-32: a reader that comes while a sample is written sees that it is torn, on any processor."""
 
-SIZE = SAMPLE.size + 4
+SHARED_SIZE = SAMPLE.size + 4
 LOOK = struct.Struct("<d")
 """When the owner last looked at the arm [s], by the monotonic clock, which all processes share;
 behind the sample."""
 
-MEMORY = SIZE + LOOK.size
-LOST = 17
+MEMORY = SHARED_SIZE + LOOK.size
+CONNECTION_LOST = 17
 """Exit code: the connection to the controller has ended."""
 
 
@@ -96,7 +96,7 @@ class Publisher(threading.Thread):
                 time.sleep(0.1 * self._period)
             if os.getppid() != self._owner:
                 self._commander.give_up()
-        os._exit(LOST)
+        os._exit(CONNECTION_LOST)
 
     def _fresh(self) -> tuple[float, list[int], list[float]] | None:
         """Return a new sample whose values are all of one cycle; None if there is none."""
@@ -123,7 +123,7 @@ class Publisher(threading.Thread):
         sample = SAMPLE.pack(
             self._count, int(sampled * 1e9), *modes, commander.remote, commander.busy(), *numbers
         )
-        self._memory[:SIZE] = sample + struct.pack("<I", zlib.crc32(sample))
+        self._memory[:SHARED_SIZE] = sample + struct.pack("<I", zlib.crc32(sample))
 
 
 class Commander:
@@ -200,7 +200,7 @@ class Commander:
 
     def _looked(self) -> float:
         """Return the time at which the owner last renewed the watchdog [s]."""
-        looked: float = LOOK.unpack_from(self._memory, SIZE)[0]
+        looked: float = LOOK.unpack_from(self._memory, SHARED_SIZE)[0]
         return max(self._answered, looked)
 
     def end(self) -> None:

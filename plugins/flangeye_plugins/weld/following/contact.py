@@ -33,7 +33,7 @@ class Mode(IntEnum):
     SEATED, PRESSED, OTHER, FREE, FALLEN = range(5)
 
 
-LOST = 0.9
+LOSS_PROBABILITY = 0.9
 """Contact is lost above this probability of a free tip, and regained below its complement."""
 
 RISE = 0.5e-3

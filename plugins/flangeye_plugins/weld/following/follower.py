@@ -12,7 +12,7 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.contact import LOST, STRAINED, STRIDE
+from flangeye_plugins.weld.following.contact import LOSS_PROBABILITY, STRAINED, STRIDE
 from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.response import Response
 from flangeye_plugins.weld.following.sensing import SeamEstimate, SeamReading, Sensing
@@ -244,7 +244,7 @@ class Follower:
         # A tip that waits for its wall feels it within three time constants of the servo.
         if doubt > 3.0 / self.task.settings.servo_gain + self._delay:
             contact.lose()
-        return contact.free > LOST
+        return contact.free > LOSS_PROBABILITY
 
     def _learn(self) -> None:
         """Evaluate the sweep: start to follow, stop, or let the sweep repeat."""

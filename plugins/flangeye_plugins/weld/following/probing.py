@@ -41,7 +41,7 @@ PIVOTS = 0.1
 PIVOTED = 0.02e-3
 """Best accuracy of the tip distance estimated by the sweep [m]."""
 
-LONGEST = 4.0
+REST_TIMEOUT = 4.0
 """Longest wait for the tip to rest, or for enough measurements at the hard end [s]."""
 
 
@@ -106,7 +106,7 @@ class Probing:
         rested = felt[len(felt) // 2 :]
         told = bool(rested) and len(rested) >= self._enough
         # No sooner the tip has come to rest where it met the wall.
-        if self._time < 0.4 or (not told and self._time < LONGEST):
+        if self._time < 0.4 or (not told and self._time < REST_TIMEOUT):
             return None
         return float(np.mean(rested)) if rested else self._reach / SOFTER
 
@@ -127,7 +127,7 @@ class Probing:
     def _settled(self) -> bool:
         """Return whether enough measurements were taken at the end of this stroke."""
         since, before = self._pressed = self._pressed or (self._time, len(self._felt))
-        return len(self._felt) - before >= self._enough or self._time - since > LONGEST
+        return len(self._felt) - before >= self._enough or self._time - since > REST_TIMEOUT
 
     @property
     def _enough(self) -> float:

@@ -23,7 +23,7 @@ from flangeye_plugins.weld.path import PATH_SPACING, Path
 SLOPE = 1.5e-3
 """Half the base length of the finite difference for the path's direction [m]."""
 
-SIZES, LENGTHS = (1.0, 3.0, 10.0), (4e-3, 12e-3, 36e-3)
+SIZES, CORRELATIONS = (1.0, 3.0, 10.0), (4e-3, 12e-3, 36e-3)
 """Filter bank: standard deviations as multiples of ``wander``, and correlation lengths [m]."""
 
 PRIOR = np.array([5e-3, 5e-3, 0.05])
@@ -85,7 +85,7 @@ class RefinedPath:
         """
         self._plan, self.empty = plan, True
         self.noise = 0.01e-3  # until the sweep measures it
-        sizes, lengths = (grid.ravel() for grid in np.meshgrid(SIZES, LENGTHS, indexing="ij"))
+        sizes, lengths = (grid.ravel() for grid in np.meshgrid(SIZES, CORRELATIONS, indexing="ij"))
         self._field = _Field(wander * sizes, lengths)
         models, self._start = len(sizes), -margin
         count = int((plan.length + 2 * margin) / PATH_SPACING) + 2
@@ -263,7 +263,7 @@ class RefinedPath:
 
         It is the shortest correlation length behind the tip.
         """
-        return self._at - LENGTHS[0]
+        return self._at - CORRELATIONS[0]
 
     def angle(self, s: float, otherwise: float) -> float:
         """Return the tool's angle [rad] at the measurement nearest to ``s``, or ``otherwise``."""

@@ -14,7 +14,7 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.settings import Following
 
-MOST = 60
+MEAN_OF = 60
 """Largest number of measurements in a mean."""
 
 UNTOUCHED = 0.5e-3
@@ -50,7 +50,7 @@ class SweepSearch:
         both = [settings.reach, -settings.reach]
         self._turns = both if prior.two_walls else [settings.sign * settings.reach]
         self._free: list[Floats] = []
-        self._newest: deque[tuple[float, float]] = deque(maxlen=MOST)
+        self._newest: deque[tuple[float, float]] = deque(maxlen=MEAN_OF)
 
     def feel(self, displacement: Floats, deflection: float, compression: float) -> None:
         """Process a measurement of the tip.
@@ -79,7 +79,7 @@ class SweepSearch:
         # Ten measurements in the air, before the tip descends, and as many as resolve a quarter of
         # the preload: a rest position that is off would be taken for a touch.
         enough = _needed(SIGMA_OF_MAD * usual, self._settings.preload / 4)
-        if len(free) < np.clip(enough, 10, 5 * MOST):
+        if len(free) < np.clip(enough, 10, 5 * MEAN_OF):
             return
         self.resting, self.rest = False, np.median(free, axis=0)
         self.sigma = np.maximum(self.sigma, free.std(axis=0))
@@ -94,7 +94,7 @@ class SweepSearch:
 
     def _mean(self, axis: int, threshold: float) -> float:
         """Return the mean of enough measurements for a decision at a threshold [m]; 0 before."""
-        count = int(np.clip(_needed(self.sigma[1 + axis], threshold), 3, MOST))
+        count = int(np.clip(_needed(self.sigma[1 + axis], threshold), 3, MEAN_OF))
         newest = [sample[axis] for sample in self._newest][-count:]
         return sum(newest) / len(newest) if len(newest) == count else 0.0
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.contact import LOST, Contact, ContactMeasurement
+from flangeye_plugins.weld.following.contact import LOSS_PROBABILITY, Contact, ContactMeasurement
 from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.probing import SOFTER, SWEEP_MARGIN, Probing
 from flangeye_plugins.weld.following.refined import RefinedPath
@@ -341,7 +341,7 @@ class SeamEstimate:
         spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
         expected = time, s, seam.offset, found.angle, aside, spread, seam.height
         self.contact.take(ContactMeasurement(*expected, found.deflection, found.compression), side)
-        if self.contact.free <= LOST:
+        if self.contact.free <= LOSS_PROBABILITY:
             self.lost = None
         elif self.lost is None:
             self.lost = time
@@ -381,7 +381,10 @@ class SeamEstimate:
         Probability alone is not enough, as a free tip moves with the arm and may coincide with the
         expected seam: the tip must be deflected as well.
         """
-        return self.contact.free < 1.0 - LOST and self.contact.deflection > pressing.most / 2.0
+        return (
+            self.contact.free < 1.0 - LOSS_PROBABILITY
+            and self.contact.deflection > pressing.most / 2.0
+        )
 
     def moved(self, found: TipPosition) -> str:
         """Return a message if the seam has moved since the weld that is resumed; else ""."""

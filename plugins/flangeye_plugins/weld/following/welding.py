@@ -16,7 +16,7 @@ from flangeye_plugins.weld.following.steering import ArcSequence, TorchLead
 from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.following.tip import DeflectionTarget, SeamProgress
 
-SHORT = 0.01
+LEFT_OUT = 0.01
 """Largest share of the planned seam that a complete weld may leave out."""
 
 
@@ -162,7 +162,7 @@ class Welding:
     @property
     def complete(self) -> bool:
         """Whether the whole planned seam was welded, up to 1 %."""
-        return self.arc_from is not None and self.share >= 1.0 - SHORT
+        return self.arc_from is not None and self.share >= 1.0 - LEFT_OUT
 
     def too_uncertain(self, bound: float, where: str = "") -> str:
         """Return the reason for refusing or stopping a weld with too wide a bound [m]."""
@@ -239,7 +239,7 @@ class Welding:
             late = torch > task.before.torch
             again = "the torch was not on the seam again where it had stopped; raise 'overlap'"
             return again if late else ""
-        if torch - self.begins <= SHORT * (self.ends - self.begins):
+        if torch - self.begins <= LEFT_OUT * (self.ends - self.begins):
             return ""
         ahead = f" at {place * 1e3:.0f} mm of the seam" if place > torch else ""
         return f"not begun: {self.too_uncertain(bound, ahead)}"

@@ -14,7 +14,7 @@ import pytest
 from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.estimation.watch.drift import DriftTest
-from flangeye.workflow.doctor.monitor.chart import COLOURS, figure, sentence, write_chart
+from flangeye.workflow.doctor.monitor.chart import STATE_COLOURS, figure, sentence, write_chart
 from flangeye.workflow.doctor.monitor.history import (
     CheckFinding,
     History,
@@ -205,13 +205,13 @@ def test_the_chart_has_shifts_above_and_the_step_test_below_with_their_limits(
     shifts, steps = chart.data
     assert list(shifts.y) == pytest.approx([1.0, 2.0, 3.0]) and list(steps.y) == [0.0, 0.5, 1.0]
     assert [f"{at:%H:%M:%S}" for at in shifts.x] == ["01:46:40", "02:46:40", "03:46:40"]
-    assert list(shifts.marker.color) == [COLOURS[state] for state in states]
+    assert list(shifts.marker.color) == [STATE_COLOURS[state] for state in states]
     assert list(shifts.text) == list(states)
     assert (shifts.yaxis, steps.yaxis, shifts.xaxis, steps.xaxis) == ("y", "y2", "x", "x2")
     limits = [(line.y0, line.yref, line.line.color) for line in chart.layout.shapes]
     assert [each[0] for each in limits] == pytest.approx([0.8, 0.4, 1.0])
     assert [each[1:] for each in limits] == [
-        ("y", COLOURS["MOVED"]), ("y", COLOURS["DEGRADED"]), ("y2", COLOURS["MOVED"])
+        ("y", STATE_COLOURS["MOVED"]), ("y", STATE_COLOURS["DEGRADED"]), ("y2", STATE_COLOURS["MOVED"])
     ]  # fmt: skip
     layout = chart.layout
     assert (layout.yaxis.title.text, layout.yaxis2.title.text) == (

@@ -15,7 +15,7 @@ from flangeye.workflow.doctor.monitor.history import MonitorCheck, prints_of
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration
 from flangeye.workflow.log.read import RunLog, log_of, read_run
 from flangeye.workflow.recipe.load import parse_recipe
-from flangeye.workflow.run.folder import CHECKS, RunFolder, recipe_of_log
+from flangeye.workflow.run.folder import CHECKS_FOLDER, RunFolder, recipe_of_log
 from flangeye.workflow.run.runner import Runner
 from flangeye.workflow.run.session import record_scans
 
@@ -74,7 +74,7 @@ def from_arm(
             "--archive"
         )
     recipe = recipe_of_log(stored.log, registry, overrides)
-    folder = RunFolder.create("check", None, stored.path.parent / CHECKS)
+    folder = RunFolder.create("check", None, stored.path.parent / CHECKS_FOLDER)
     record_scans(recipe, registry, folder, MotionAllowed(move), scans)
     return _checked(stored, folder.path, *_of_log(read_run(folder.log)))
 

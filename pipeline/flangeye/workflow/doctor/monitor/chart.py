@@ -11,7 +11,11 @@ from flangeye.files.regular import write_whole
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History
 from flangeye.workflow.report.look import LIGHT, SERIES, templates
 
-COLOURS = {"OK": LIGHT["verified"], "DEGRADED": LIGHT["unverified"], "MOVED": LIGHT["refused"]}
+STATE_COLOURS = {
+    "OK": LIGHT["verified"],
+    "DEGRADED": LIGHT["unverified"],
+    "MOVED": LIGHT["refused"],
+}
 
 
 def write_chart(history: History, test: DriftTest, path: Path) -> None:
@@ -23,7 +27,7 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
     last = history.findings[-1]
     page = templates(Path(__file__).parent).get_template("chart.html.j2").render(
         ink=LIGHT["ink"], paper=LIGHT["paper"],
-        state=last.state, colour=COLOURS[last.state], sentence=sentence(last),
+        state=last.state, colour=STATE_COLOURS[last.state], sentence=sentence(last),
         figure=figure(history, test).to_html(full_html=False, include_plotlyjs="inline"),
         checks=len(history.findings), path=history.path, rate=test.false_alarms,
     )  # fmt: skip
@@ -47,7 +51,7 @@ def figure(history: History, test: DriftTest) -> Any:
         rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.65, 0.35]
     )
     at = _axis(history)
-    colours = [COLOURS[f.state] for f in history.findings]
+    colours = [STATE_COLOURS[f.state] for f in history.findings]
     shifts = [f.shift * 1e3 for f in history.findings]
     chart.add_scatter(
         x=at, y=shifts, mode="lines+markers", line={"color": LIGHT["axis"], "width": 1},
@@ -59,9 +63,11 @@ def figure(history: History, test: DriftTest) -> Any:
         line={"color": SERIES["used"]}, hovertemplate="%{y:.2f}<extra></extra>", row=2, col=1,
     )  # fmt: skip
     limit = test.limit * 1e3
-    chart.add_hline(y=limit, line_color=COLOURS["MOVED"], line_dash="dot", row=1, col=1)
-    chart.add_hline(y=limit / 2, line_color=COLOURS["DEGRADED"], line_dash="dot", row=1, col=1)
-    chart.add_hline(y=1.0, line_color=COLOURS["MOVED"], line_dash="dot", row=2, col=1)
+    chart.add_hline(y=limit, line_color=STATE_COLOURS["MOVED"], line_dash="dot", row=1, col=1)
+    chart.add_hline(
+        y=limit / 2, line_color=STATE_COLOURS["DEGRADED"], line_dash="dot", row=1, col=1
+    )
+    chart.add_hline(y=1.0, line_color=STATE_COLOURS["MOVED"], line_dash="dot", row=2, col=1)
     chart.update_yaxes(title_text="shift of the work, mm", rangemode="tozero", row=1, col=1)
     chart.update_yaxes(title_text="step test / threshold", rangemode="tozero", row=2, col=1)
     if len(at) == 1:  # nothing else fixes the axis, and it would show the milliseconds

@@ -27,7 +27,7 @@ from flangeye.types.pose_formats import (
 )
 from flangeye.types.pose_formats import convention_of_maker as usual_of
 from flangeye.workflow.recipe.draft.evidence import (
-    TURN,
+    FULL_TURN,
     Choice,
     Writing,
     mounting_of,
@@ -37,7 +37,7 @@ from flangeye.workflow.recipe.draft.evidence import (
     writing_of,
 )
 from flangeye.workflow.recipe.draft.headings import (
-    JOINTS,
+    JOINTS_ONLY,
     Headings,
     PoseColumns,
     as_joints,
@@ -98,7 +98,7 @@ def table_params(
     for pose in filter(None, (arm, target)):
         if MATRIX in pose.rotations and by_columns(_finite(_numbers(pose))):
             questions.assumed.append(f"{pose.name}: matrices of 16 numbers, column by column")
-    if arm.rotations == JOINTS:
+    if arm.rotations == JOINTS_ONLY:
         params = _of_joints(arm, questions, robot)
     else:
         params = _written(arm, questions, "", robot.maker if robot else None) | _rest(arm.table)
@@ -135,7 +135,7 @@ def _of_joints(arm: PoseColumns, questions: Questions, robot: RobotModel | None)
         )
     unit = questions.given.get("angle") or _angle(_numbers(arm), arm)
     joints = {"joints": list(arm.columns), "joint_unit": unit}
-    return {"rotation": JOINTS[0]} | _rest(arm.table) | joints
+    return {"rotation": JOINTS_ONLY[0]} | _rest(arm.table) | joints
 
 
 def _file(table: Table) -> dict[str, Any]:
@@ -174,12 +174,15 @@ def _arm(
 ) -> PoseColumns:
     """Return the columns of the arm's poses."""
     asked = questions.given.get("table")
-    given, joints = questions.given.get("columns"), questions.given.get("rotation") == JOINTS[0]
+    given, joints = (
+        questions.given.get("columns"),
+        questions.given.get("rotation") == JOINTS_ONLY[0],
+    )
     if given is not None:
         table = _table_of(tables, found, questions)
         own = [pose for pose in found if pose.table is table]
-        return _named(table, given, own, JOINTS if joints else ())
-    angles = [p for p in found if p.rotations == JOINTS] + _joints(tables)
+        return _named(table, given, own, JOINTS_ONLY if joints else ())
+    angles = [p for p in found if p.rotations == JOINTS_ONLY] + _joints(tables)
     poses = [p for p in found if p.is_pose]
     if joints:
         poses = angles or [as_joints(p) for p in poses]
@@ -243,7 +246,7 @@ def _place(pose: PoseColumns) -> str:
 def _joints(tables: Sequence[Table]) -> list[PoseColumns]:
     """Return the joint angles that columns are named after."""
     rest = [(table, poses_of(table)[1]) for table in tables]
-    return [PoseColumns(t, r.joints, JOINTS, angle=r.joint_unit) for t, r in rest if r.joints]
+    return [PoseColumns(t, r.joints, JOINTS_ONLY, angle=r.joint_unit) for t, r in rest if r.joints]
 
 
 def _table_of(tables: Sequence[Table], found: Sequence[PoseColumns], questions: Questions) -> Table:
@@ -297,13 +300,13 @@ def _target(
     timed = poses_of(arm.table)[1].time is not None
     others = [
         p for p in found
-        if p != arm and p.role != "arm" and p.rotations != JOINTS
+        if p != arm and p.role != "arm" and p.rotations != JOINTS_ONLY
         and (len(p.table.rows) == len(arm.table.rows)
              or (timed and poses_of(p.table)[1].time is not None))
     ]  # fmt: skip
     if not others and arm.role is None:
         others = [
-            p for p in found if p.rotations != JOINTS and p != arm and p.columns != arm.columns
+            p for p in found if p.rotations != JOINTS_ONLY and p != arm and p.columns != arm.columns
         ]
     seen = [p for p in others if p.role == "target"] or others
     whole = [p for p in seen if p.is_pose] or seen
@@ -372,7 +375,11 @@ def _seen_together(
     if found is None:
         if ":1/2" in arm.table.name:
             raise RecipeError(_alone(arm))
-        if arm.rotations != JOINTS and arm.may_be_joints and not questions.given.get("rotation"):
+        if (
+            arm.rotations != JOINTS_ONLY
+            and arm.may_be_joints
+            and not questions.given.get("rotation")
+        ):
             raise RecipeError(_neither(arm, robot))
         return arm, target
     arm, target, choice = found
@@ -384,7 +391,7 @@ def _seen_together(
             )
         questions.likely[f"{prefix}rotation"] = (writing.rotation, choice.told)
         questions.likely[f"{prefix}angle"] = (writing.angle, choice.told)
-    if choice.arm.kinematics is not None and arm.rotations != JOINTS:
+    if choice.arm.kinematics is not None and arm.rotations != JOINTS_ONLY:
         arm = as_joints(arm)
         questions.assumed.append(f"{_place(arm)}: joint angles ({choice.told}; --rotation says "
                                  "otherwise)")  # fmt: skip
@@ -480,8 +487,8 @@ def _writings(
 ) -> list[Writing]:
     """Return the possible conventions of a pose's numbers, the most likely first."""
     given = questions.given.get(f"{prefix}rotation")
-    joints = _as_angles(pose, numbers, robot) if given in (None, JOINTS[0]) else []
-    if pose.rotations == JOINTS:
+    joints = _as_angles(pose, numbers, robot) if given in (None, JOINTS_ONLY[0]) else []
+    if pose.rotations == JOINTS_ONLY:
         return joints
     usual = usual_of(robot.maker if robot else None)
     named = [given] if given else list(pose.rotations or usual_rotations())
@@ -505,7 +512,7 @@ def _as_angles(pose: PoseColumns, numbers: Floats, robot: RobotModel | None) -> 
     if robot is None or len(robot.joints) != numbers.shape[1] or not pose.may_be_joints:
         return []
     angles = as_joints(pose)
-    return [Writing(JOINTS[0], "m", _turn_unit(_angle(_numbers(angles), angles)), Arm(robot))]
+    return [Writing(JOINTS_ONLY[0], "m", _turn_unit(_angle(_numbers(angles), angles)), Arm(robot))]
 
 
 def _unit(word: str) -> LengthUnit:
@@ -602,8 +609,8 @@ def _ask_lengths(arm: PoseColumns, target: PoseColumns | None, questions: Questi
 def _angle(numbers: Floats, pose: PoseColumns) -> str:
     if pose.angle is not None:
         return pose.angle
-    turns = numbers if pose.rotations == JOINTS else numbers[:, 3:6]
-    return "deg" if np.nanmax(np.abs(turns), initial=0) > TURN else "rad"
+    turns = numbers if pose.rotations == JOINTS_ONLY else numbers[:, 3:6]
+    return "deg" if np.nanmax(np.abs(turns), initial=0) > FULL_TURN else "rad"
 
 
 def _direction(pose: PoseColumns, questions: Questions, prefix: str) -> str:
@@ -642,7 +649,7 @@ def _rest(table: Table) -> dict[str, Any]:
         params |= {"time": rest.time} | ({"time_unit": unit} if unit else {})
     if rest.joints:
         angles = table.numbers(table.indices(rest.joints))
-        degrees = np.nanmax(np.abs(angles)) > TURN
+        degrees = np.nanmax(np.abs(angles)) > FULL_TURN
         unit = rest.joint_unit or ("deg" if degrees else "rad")
         params |= {"joints": list(rest.joints), "joint_unit": unit}
     return params

@@ -24,13 +24,13 @@ from flangeye.maths.pose_corrections import inverted
 from flangeye.types import Floats
 from flangeye.types.geometry import rigid
 from flangeye.types.pose_formats import AngleUnit, LengthUnit, pose_of_numbers
-from flangeye.workflow.recipe.draft.headings import JOINTS, Headings, PoseColumns
+from flangeye.workflow.recipe.draft.headings import JOINTS_ONLY, Headings, PoseColumns
 
 Key = TypeVar("Key")
 
 ROUNDED = 5e-3
 """Tolerance of a written quaternion's length, and of a rotation matrix's orthogonality."""
-TURN = 2 * math.pi + 0.01
+FULL_TURN = 2 * math.pi + 0.01
 """Angles [rad] beyond it are degrees."""
 
 
@@ -150,7 +150,7 @@ def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> Pose
             table, tuple(columns), ("quaternion_xyzw", "quaternion_wxyz"), guess=told
         )
     angles = np.nanmax(np.abs(numbers)) <= 360.0
-    return PoseColumns(table, tuple(part), JOINTS, guess=told) if angles else None
+    return PoseColumns(table, tuple(part), JOINTS_ONLY, guess=told) if angles else None
 
 
 def _quaternion_at(numbers: Floats) -> int | None:
@@ -168,10 +168,10 @@ def _of_six(table: Table, part: list[int], numbers: Floats, told: str) -> PoseCo
     These are the three that exceed any angle; if that is not unique, the first three.
     """
     if "joint" in table.name.lower():
-        return PoseColumns(table, tuple(part), JOINTS, guess=told)
+        return PoseColumns(table, tuple(part), JOINTS_ONLY, guess=told)
     first, second = (float(np.nanmax(np.abs(numbers[:, at]))) for at in ([0, 1, 2], [3, 4, 5]))
     largest = 360.0  # of an angle in degrees, beside a position in metres
-    turned_first = second > largest and first < TURN
+    turned_first = second > largest and first < FULL_TURN
     columns: list[Column] = [*part[3:], *part[:3]] if turned_first else [*part]
     if turned_first:
         told = "; ".join(filter(None, (told, f"the rotation in columns {part[0]} to {part[2]}")))

@@ -15,9 +15,9 @@ from flangeye.files.tables import Cell, Column, Table, entry_of_list, number_of
 from flangeye.models.robots import joints_in_order
 from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
 
-JOINTS = ("joints",)
+JOINTS_ONLY = ("joints",)
 """Stands for a rotation if the columns hold joint angles."""
-_PLACES = (
+_POSITION_WORDS = (
     "position", "pos", "translation", "trans", "tvec", "location", "origin", "t", "p", "xyz",
 )  # fmt: skip
 _TURNS: Mapping[str, str] = {
@@ -28,9 +28,9 @@ _TURNS: Mapping[str, str] = {
 """Names of rotations, and the prefixes of their columns' names."""
 _OPENCV = ("rvec", "tvec")
 """OpenCV's names for the pose of an object in the camera."""
-_POSES: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
+_ROTATIONS: Mapping[int, str | None] = {6: None, 7: "xyzw", 12: "matrix", 16: "matrix"}
 """Lengths of lists that are whole poses, and what their numbers are unless a name decides."""
-_JOINT = re.compile(
+_JOINT_HEADING = re.compile(
     r"(?:j_?\d|(?:q|a|axis|theta)_?[1-9])(?:_?(?:rad|deg|pos|position))?"
     r"|(?!.*(?:vel|eff|torque|acc|current|temp)).*joint.*"
 )
@@ -91,8 +91,8 @@ class PoseColumns:
     Attributes:
         table: Table with the columns.
         columns: Names or numbers from 1: position first, then rotation.
-        rotations: Possible notations of the rotation; ``point`` without one, :data:`JOINTS` for
-            joint angles.
+        rotations: Possible notations of the rotation; ``point`` without one,
+            :data:`JOINTS_ONLY` for joint angles.
         called: Common name of the columns; empty without one.
         length: Unit of the position, if stated in a name.
         angle: Unit of the angles, if stated in a name.
@@ -117,14 +117,14 @@ class PoseColumns:
     @property
     def is_pose(self) -> bool:
         """Whether the columns are a whole pose."""
-        return self.rotations not in (("point",), JOINTS)
+        return self.rotations not in (("point",), JOINTS_ONLY)
 
     @property
     def may_be_joints(self) -> bool:
         """Whether the columns are joint angles, or unnamed numbers that may be."""
         numbers = [column for column in self.columns if isinstance(column, int)]
         nameless = len(numbers) == len(self.columns) == 6 and numbers == sorted(numbers)
-        return self.rotations == JOINTS or (nameless and not self.rotations)
+        return self.rotations == JOINTS_ONLY or (nameless and not self.rotations)
 
     @property
     def role(self) -> str | None:
@@ -173,7 +173,7 @@ class PoseColumns:
 
 def as_joints(pose: PoseColumns) -> PoseColumns:
     """Return the same columns as joint angles."""
-    return replace(pose, rotations=JOINTS)
+    return replace(pose, rotations=JOINTS_ONLY)
 
 
 @dataclass
@@ -228,8 +228,8 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         listed = lists.get(name, "")
         size, nth = sizes[listed], seen[listed]
         seen[listed] += bool(listed)
-        joint = _JOINT.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
-        joint = joint or _JOINT.fullmatch(name.lower())
+        joint = _JOINT_HEADING.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
+        joint = joint or _JOINT_HEADING.fullmatch(name.lower())
         joint = joint or re.fullmatch(r"(.*[._])?q", listed.lower()) if size > 4 else joint
         order = "wxyz" if "wxyz" in listed.lower() else "xyzw"
         words = _of_list(listed, order[nth]) if size in (3, 4) else _words(listed if size else name)
@@ -242,7 +242,7 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         elif joint and not _is_quaternion(table, name):
             unit = next((u for u in ANGLES if u == words[-1].lower()), None)
             rest = replace(rest, joints=(*rest.joints, name), joint_unit=unit)
-        elif size in (*_POSES, 9):
+        elif size in (*_ROTATIONS, 9):
             if nth == 0:
                 _put_list(groups, words, listed, size)
         elif words and not size > 4:
@@ -297,7 +297,7 @@ def lists_in(names: Sequence[str]) -> dict[str, str]:
     return {
         name: listed
         for name, (listed, entry) in found.items()
-        if entry[0] == "." or sizes[listed] in (3, 4, 9, *_POSES)
+        if entry[0] == "." or sizes[listed] in (3, 4, 9, *_ROTATIONS)
     }
 
 
@@ -345,7 +345,7 @@ def _put(
     plain = axis in ("x", "y", "z", "w")
     # Behind a name of its own (orientation.roll) only a whole word is no part of the pose's name
     whole = [word for word in _TURNS if len(word) > 1]
-    part, before = _without(before, (*_PLACES, *_TURNS) if plain else whole)
+    part, before = _without(before, (*_POSITION_WORDS, *_TURNS) if plain else whole)
     axis = ("q" if listed else _TURNS.get(part, "") if plain else "") + axis
     called = "_".join(before) or (part if part in _OPENCV else "")
     group = groups.setdefault("" if called in _OPENCV else called, Group())
@@ -387,7 +387,7 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     """Return a group of columns as a pose or point; None without a position."""
     stated = (group.words, group.length, group.angle)
     if group.whole is not None:
-        usual = _POSES[group.many]
+        usual = _ROTATIONS[group.many]
         rotations = (usual,) if usual and group.many != 7 else ("xyzw", "wxyz") if usual else ()
         if group.many == 6 and table.convention:
             rotations = (table.convention,)

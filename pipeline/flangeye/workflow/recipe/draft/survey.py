@@ -16,8 +16,8 @@ from flangeye.files.clouds import CONVERSIONS
 from flangeye.files.images import is_depth_image
 from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import is_pointer
-from flangeye.files.scans import CLOUDS, IMAGES, is_matrix, natural, texts_of_points
-from flangeye.files.tables import KINDS, Table, number_of, read_table, tables_in
+from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES, is_matrix, natural, texts_of_points
+from flangeye.files.tables import DOCUMENT_READERS, Table, number_of, read_table, tables_in
 from flangeye.workflow.recipe.draft.headings import lists_in, role_in
 
 Prompt = Callable[[str, str | None], str]
@@ -130,7 +130,7 @@ class FolderSurvey:
     @property
     def clouds(self) -> list[Path]:
         """The clouds, those in texts and archives of arrays too."""
-        found = {*(p for p in self.of(CLOUDS) if not is_matrix(p)), *self.points}
+        found = {*(p for p in self.of(CLOUD_SUFFIXES) if not is_matrix(p)), *self.points}
         return [path for path in self.files if path in found or is_depth_image(path)]
 
     @property
@@ -219,7 +219,7 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
     groups: dict[str, list[Path]] = defaultdict(list)
     known = (
         ".csv", ".txt", ".md", ".dat", ".tsv", ".tum", ".log", ".mod", ".src", ".ls", ".script",
-        *KINDS,
+        *DOCUMENT_READERS,
     )  # fmt: skip
     for file in files:
         # A file that is larger [bytes] holds scans, and is not looked into
