@@ -89,8 +89,8 @@ class Toucher:
             raise DeviceError(
                 f"the arm was sent to {STOP_BEFORE * 1e3:g} mm before point {number} and its tip "
                 f"stands {away * 1e3:.0f} mm from it: it moved since, or it is an emulator that "
-                "starts anew with each connection (start 'flangeye emulator' and name its address with "
-                "--set)"
+                "starts anew with each connection (start 'flangeye emulator' and name its address "
+                "with --set)"
             )
 
     def _approach(self, number: int, point: Floats) -> None:

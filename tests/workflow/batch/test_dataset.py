@@ -26,7 +26,7 @@ def row(i: int, status: Any = "verified", report: str | None = None) -> Any:
 
 @pytest.fixture
 def rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dataset:
-    monkeypatch.setattr(module, "BLOCK", 4)
+    monkeypatch.setattr(module, "FILE_SESSIONS", 4)
     return Dataset(place_at(str(tmp_path)), COLUMNS)
 
 
