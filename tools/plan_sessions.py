@@ -180,7 +180,8 @@ def do_nothing(job: Any, chunk: Any) -> ChunkDone:
 def scheduling_seconds() -> float:
     """Return what client and scheduler, both in this process, spend on a session [s]."""
     sessions: Any = list(enumerate(SimpleNamespace(id=str(k)) for k in range(MEASURED)))
-    ahead = patch.object(cluster, "CHUNKS_AHEAD", 100 * cluster.CHUNKS_AHEAD)  # as for a hundred workers
+    # As for a hundred workers
+    ahead = patch.object(cluster, "CHUNKS_AHEAD", 100 * cluster.CHUNKS_AHEAD)
     with ahead, patch.object(cluster, "run_chunk", do_nothing), cluster.local_client(1) as client:
         job: Any = None
         list(cluster.run_all(client, job, sessions[:100], 100))
