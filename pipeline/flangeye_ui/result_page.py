@@ -115,7 +115,7 @@ class TouchBox:
         touches = [*old.get("touches", []), _touch(given)]
         self._project.write_step("verify.touch", {"tip": given["tip"], "touches": touches})
         self._keep.set_enabled(False)
-        ui.notify(f"The recipe has the point: verify.touch, {len(touches)} in all.")
+        ui.notify(f"Added: the recipe's verify.touch holds {len(touches)} of them now.")
 
 
 def _touch(given: dict[str, list[str]]) -> dict[str, list[str]]:

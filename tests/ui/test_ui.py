@@ -890,7 +890,7 @@ def test_a_point_is_checked_by_touch(browser: Any, served: Served, finished: Pat
     page.get_by_text("Check it by touch").evaluate("box => box.scrollIntoView({block: 'start'})")
     shot(page, "touch")
     page.get_by_role("button", name="Add this point to the recipe").click()
-    page.get_by_text("The recipe has the point: verify.touch, 1 in all.").wait_for()
+    page.get_by_text("Added: the recipe's verify.touch holds 1 of them now.").wait_for()
     recipe, mistakes = Project(served.folder, load_registry(), MoveCodes(print)).check()
     assert recipe is not None and mistakes == []
     assert recipe.steps[-1].stage.name == "verify.touch"

@@ -360,7 +360,10 @@ def unobservable(
 
 
 def _meaningful(problem: Problem, places: Places) -> Floats:
-    """Return (P, m) an orthonormal basis of all moves but the meaningless ones."""
+    """Return (P, m) an orthonormal basis of the moves that change what a sighting predicts.
+
+    A round target's turn about its own axis does not.
+    """
     nothing = _turned(problem, places, meaningless(problem))
     if not nothing.shape[1]:
         return np.eye(len(nothing))

@@ -260,7 +260,7 @@ class Part(Plugin):
         return "reads_only" in self.needs
 
     def bind(self, params: Params | None = None) -> BoundPart:
-        """Return the part with its parameters, as a step's parameter holds it."""
+        """Return the part together with its parameters, as a recipe's step states it."""
         return BoundPart(self, params if params or not self.params else self.params())
 
 

@@ -65,8 +65,8 @@ class ArmCorrection:
     Attributes:
         tool_offset: (3,) the seen circle's centre in ``flange`` [m].
         joint_offsets: (n,) to add to the joint angles [rad], or None.
-        joints: (n,) a configuration of the arm on the branch that it was in [rad], from which
-            the angles of a pose without any are found; with ``joint_offsets``.
+        joints: (n,) joint angles of one pose of the session [rad]. Where a pose comes without
+            joint angles, inverse kinematics starts from these; with ``joint_offsets``.
         lengths: (n, 3) to add to each joint's Denavit-Hartenberg ``a``, ``d`` [m] and ``alpha``
             [rad], or None; with ``joint_offsets``.
         field: Smooth displacement of where the arm reports the flange's origin, to add to it in

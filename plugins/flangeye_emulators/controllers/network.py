@@ -108,7 +108,7 @@ class Connection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Register the connection."""
         if not isinstance(transport, asyncio.Transport):
-            raise TypeError("a connection is a stream")
+            raise TypeError("only stream connections (TCP) are supported")
         self._transport = transport
         self._network.connections.add(self)
         self.hold(self._network.frozen)

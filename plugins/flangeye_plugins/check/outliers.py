@@ -163,7 +163,7 @@ def _flipped(
 TOO_UNCERTAIN = np.radians(2.0)
 """Uncertainty of the camera's rotation that is not an answer (one sigma) [rad]."""
 SHIFT = 5e-3
-"""Likewise of where it sees the work [m]."""
+"""Uncertainty of a point of the work, seen by the camera, that is not an answer [m]."""
 LITTLE = np.radians(10.0)
 """Poses that differ by less do not turn the target enough [rad]."""
 

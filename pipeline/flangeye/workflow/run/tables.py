@@ -71,7 +71,7 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
 
 
 def _write_scans(log: RunLog, folder: Path) -> dict[str, str]:
-    """Write the scans, and return the file of each capture, as a table has it."""
+    """Write the scans; return each capture's file, relative to the folder."""
     (folder / "clouds").mkdir(parents=True, exist_ok=True)
     files = {}
     for capture in log.captures():
