@@ -304,7 +304,9 @@ def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
     if told and told.truth:
         error = f"{millimetres(told.truth.rms)} mm rms, {millimetres(told.truth.max)} mm at most"
         rows.append(("True error, of the simulation", error))
-        rows.append(("Points of which the stated tube contains the true seam", f"{told.truth.inside:.0%}"))
+        rows.append(
+            ("Points of which the stated tube contains the true seam", f"{told.truth.inside:.0%}")
+        )
     return rows
 
 
