@@ -80,7 +80,8 @@ def simulate(
         centre = TRUTH.inverse().apply(seen) + 0.05 * MM * rng.standard_normal(3)
         normal = TRUTH.rotation.T @ rotation_exp(5e-4 * rng.standard_normal(3)) @ true[:3, 2]
         across = 25e-8 * (np.eye(3) - np.outer(normal, normal))
-        circle = CircleFeature(centre, normal, {}, np.eye(3) * (0.05 * MM) ** 2, across, 1.0)
+        radii = {"rim": 31.5 * MM}
+        circle = CircleFeature(centre, normal, radii, np.eye(3) * (0.05 * MM) ** 2, across, 1.0)
         pose = Transform(BASE, FLANGE, arm.flange(joints))
         observations.append(
             Observation(f"{i:02d}", circle, by_frame(pose), joints if with_joints else None)
