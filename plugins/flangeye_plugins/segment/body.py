@@ -91,16 +91,9 @@ def segment_body(
     if len(points) < FEWEST_ON_BODY:
         return Rejected("no point between near and far")
     looks = prepared(body)
-    freedoms, _, axis = looks.symmetry
-    if freedoms == 3:
+    if looks.symmetry.freedoms == 3:
         return _ball(capture, looks, params)
-    # The axis of a body of revolution is the only direction in which its pose can be compared.
-    if freedoms == 5 and configuration.place is not None and axis[2] < 1.0 - 1e-6:
-        raise StageError(
-            f"{body.name}: a body of revolution whose axis is along ({axis[0]:.2f}, {axis[1]:.2f}, "
-            f"{axis[2]:.2f}) of its mesh; draw it with the axis along z of the "
-            f"{configuration.target}, or write target: {{body: {body.name}, at: unknown}}"
-        )
+    _require_axis(body, looks, configuration)
     search = BodySearch(points, looks)
     predicted = _predicted(capture, configuration, earlier)
     carried = list(filter(params.passed_by, search.near(predicted)))[:1]
@@ -117,6 +110,20 @@ def segment_body(
     cloud = PointCloud(capture.cloud.frame, around(points, looks, pose, *others))
     towards = -centre / np.linalg.norm(centre)
     return FlangeCloud(cloud, centre, towards, pose, others=np.array(others))
+
+
+def _require_axis(body: TargetBody, looks: Looks, configuration: Configuration) -> None:
+    """Refuse a body of revolution whose axis is not z of the frame in which it is drawn.
+
+    The solver compares z axes only. A body whose place is to be found gets a frame along its axis.
+    """
+    freedoms, _, axis = looks.symmetry
+    if freedoms == 5 and configuration.place is not None and axis[2] < 1.0 - 1e-6:
+        raise StageError(
+            f"{body.name}: a body of revolution whose axis is along ({axis[0]:.2f}, {axis[1]:.2f}, "
+            f"{axis[2]:.2f}) of its mesh; draw it with the axis along z of the "
+            f"{configuration.target}, or write target: {{body: {body.name}, at: unknown}}"
+        )
 
 
 def _ball(capture: Capture, looks: Looks, params: SegmentBodyParams) -> FlangeCloud | Rejected:
