@@ -27,7 +27,6 @@ There the second arm's pose is ``second:``, with a position and a rotation of it
 from __future__ import annotations
 
 import csv
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -38,6 +37,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.paths import exists
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import read_text
 from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES, is_cloud, with_companion
@@ -127,9 +127,9 @@ def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Record
 
 def _scan(root: Path, name: str) -> Path:
     """Return the path of a scan beside the poses, or in the only folder there that has it."""
-    if os.path.exists(root / name):  # noqa: PTH110  Path.exists raises for too long a name
+    if exists(root / name):
         return root / name
-    inside = [f / name for f in root.glob("*/") if os.path.isfile(f / name)]  # noqa: PTH113
+    inside = [folder / name for folder in root.glob("*/") if exists(folder / name)]
     return inside[0] if len(inside) == 1 else root / name
 
 

@@ -96,13 +96,9 @@ def open_npz(path: Path) -> LoadedTable:
 
 def _axes_last(array: NDArray[Any]) -> NDArray[Any] | None:
     """Return an array with x, y and z as its last index; None if it has no such index."""
-    return (
-        array
-        if _is_wide(array.shape)
-        else np.moveaxis(array, 0, -1)
-        if _is_axes_first(array.shape)
-        else None
-    )
+    if _is_wide(array.shape):
+        return array
+    return np.moveaxis(array, 0, -1) if _is_axes_first(array.shape) else None
 
 
 def _is_axes_first(shape: Shape) -> bool:
@@ -404,7 +400,7 @@ def _axis(cell: str) -> tuple[str, str]:
     rest = [word for word in words if word.removesuffix("s") not in STATED]
     fillers = ("pos", "position", "point", "points", "coord", "coordinate", "koordinate")
     known = [word for word in rest if word not in fillers]
-    by_word = {**dict(zip("xyz", "xyz", strict=True)), "px": "x", "py": "y", "pz": "z"}
+    by_word = {"x": "x", "y": "y", "z": "z", "px": "x", "py": "y", "pz": "z"}
     if len(known) < len(rest):  # ParaView's ``Points:0``
         by_word |= {"0": "x", "1": "y", "2": "z"}
     name = by_word.get(known[0]) if len(known) == 1 else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
+from flangeye.files.paths import exists
 from flangeye.files.regular import open_regular
 
 
@@ -31,8 +31,7 @@ def read_head(path: Path) -> bytes:
     Raises:
         StageError: There is no such file, or it is empty.
     """
-    # Path.exists raises where the name is longer than a file system takes.
-    if not os.path.exists(path):  # noqa: PTH110
+    if not exists(path):
         refuse(path, "does not exist")
     if path.is_dir():
         refuse(path, "is a folder, not a point cloud")
