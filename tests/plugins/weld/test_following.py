@@ -106,6 +106,9 @@ def test_the_end_of_the_seam_makes_no_step() -> None:
     done = weld(true, planning_error(true, seed=0))
     leaving = done.tip_s > true[-1, 0] - 20e-3
     assert done.tip_s.max() > true[-1, 0] + 20e-3
+    # The torch welds on as fast as before while the tip hangs past the end, pressed by nothing
+    way, last = np.ptp(done.torch_s[leaving]), np.ptp(done.time[leaving])
+    assert way / last > 0.9 * Following().speed
     cycles = round(0.1 / PERIOD)  # during which the tip goes 0.5 mm
     for path in (done.torch, done.tip, done.robot):
         lateral = path[leaving]

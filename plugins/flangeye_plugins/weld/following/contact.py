@@ -154,7 +154,12 @@ class Contact:
 
     @property
     def strained(self) -> float:
-        """Deflection as a share of the largest one at which the tip is known to stay seated."""
+        """Deflection as a share of the largest one at which the tip is known to stay seated.
+
+        It is 0 of a tip that hangs past the joint's end, where nothing compresses the finger.
+        """
+        if not self.bears:
+            return 0.0
         stands = self.steady * max(self.compression, 1e-9)
         return abs(self.deflection) / stands
 
