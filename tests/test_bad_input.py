@@ -97,6 +97,7 @@ CASES = {
     "one place": (same_place, [], "one place"),
     "millimetres as metres": (millimetres, ["--set", "steps.0.unit=m"], "millimetres"),
     "NaN everywhere": (all_nan, [], "finite"),
+    "name too long": (lambda _: None, ["--archive", "a" * 300], "File name too long"),
 }
 
 
@@ -111,6 +112,15 @@ def test_one_line_that_names_the_place(
     line = refusal(told, tmp_path)
     assert mentions in line
     assert len(line) < 400
+
+
+def test_a_file_of_a_parameter_whose_name_is_too_long(
+    archive: Path, command: Call, tmp_path: Path
+) -> None:
+    drift = f"  - verify.drift: {{reference: {'a' * 300}}}\n"
+    (tmp_path / "recipe.yaml").write_text(RECIPE + drift)
+    told = command("run", tmp_path / "recipe.yaml", "--archive", archive)
+    assert "longer than 255 bytes" in refusal(told, tmp_path)
 
 
 def test_a_disk_that_is_full(tmp_path: Path, ancorasir: Path) -> None:

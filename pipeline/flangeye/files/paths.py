@@ -35,6 +35,8 @@ def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
     if not isinstance(value, (str, Path)):
         raise ValueError("a path is text")
     path = Path(value).expanduser()
+    if any(len(os.fsencode(part)) > 255 for part in path.parts):  # NAME_MAX of Linux and others
+        raise ValueError("a name in the path is longer than 255 bytes")
     return path if info.context is None else info.context.folder / path
 
 

@@ -501,7 +501,7 @@ def _unread_joint(capture: t.Capture) -> str | None:
 
 
 def _guarded(step: Step, arguments: dict[str, Any]) -> Any:
-    """Call a stage; a mistake inside a plugin becomes one line that names it."""
+    """Call a stage; a failure of the system, or a plugin's mistake, becomes one line."""
     try:
         return step.stage.function(**arguments)
     except (FlangeyeError, MemoryError):
@@ -509,6 +509,9 @@ def _guarded(step: Step, arguments: dict[str, Any]) -> Any:
     except Exception as error:
         failed = f"{step.label}: failed with {type(error).__name__}: {error}"
         require_memory(failed)  # as libraries that cannot be loaded, and threads, fail otherwise
+        if isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            raise StageError(f"{step.label}: {where}{error.strerror or error}") from error
         raise StageError(
             f"{failed}; this is a mistake in the plugin (FLANGEYE_DEBUG=1 shows where)"
         ) from error
