@@ -5,8 +5,9 @@ sample over the rooms below, each in a copy of the repository, under those fast 
 (or those named; of a file that has none, those in real time, one at a time) that run the changed
 line (coverage.py says which, and is asked anew for a file of tests that has changed, into
 build/mutation), the file's own first, then the fastest: in a fork of a process that has them
-collected (tools/trying.py), and if it lives there, in a new process. A change that fails no test is
-a survivor: its place and what was changed are printed, and the share that was killed.
+collected (tools/trying.py). A change of what is computed at import, or of a line that runs in
+processes of the tests alone, is tried in a new process as well. A change that fails no test is a
+survivor: its place and what was changed are printed, and the share that was killed.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ MEMORY = 16 << 30
 
 class Mutation(NamedTuple):
     """One mutation: room, file, its source when the mutation was made, line, the statement's lines,
-    the node, a description, and the change.
+    the node, a description, the change, and whether it is of what is computed at import.
     """
 
     room: str
@@ -83,6 +84,7 @@ class Mutation(NamedTuple):
     node: int
     words: str
     change: Callable[[Any], Any]
+    at_import: bool
 
     def text(self) -> str:
         """Return the changed source."""
@@ -104,11 +106,13 @@ def mutations(room: str) -> Iterator[Mutation]:
     for path in sorted((ROOT / ROOMS[room][0]).rglob("*.py")):
         source, file = path.read_text("utf-8"), str(path.relative_to(ROOT))
         tree = ast.parse(source)
-        lines = _statements(tree)
+        lines, later = _statements(tree), _in_functions(tree)
         for number, node in enumerate(ast.walk(tree)):
             line = getattr(node, "lineno", 0)
             for words, change in _changes(node):
-                yield Mutation(room, file, source, line, lines[node], number, words, change)
+                yield Mutation(
+                    room, file, source, line, lines[node], number, words, change, node not in later
+                )
 
 
 def _statements(tree: ast.Module) -> dict[Any, range]:
@@ -122,6 +126,12 @@ def _statements(tree: ast.Module) -> dict[Any, range]:
             span = range(statement.lineno, last + 1)
             lines |= dict.fromkeys(ast.walk(statement), span)
     return lines
+
+
+def _in_functions(tree: ast.Module) -> set[Any]:
+    """Return the nodes that a fork's functions have: those of bodies, not of default values."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return {node for each in functions for part in each.body for node in ast.walk(part)}
 
 
 def _changes(node: Any) -> Iterator[tuple[str, Callable[[Any], Any]]]:
@@ -168,10 +178,15 @@ class Tests:
         returned. The total is limited by a budget of processor time [s].
         """
         of_file = self._lines.get(file, {})
-        run = {test for line in lines for test in of_file.get(line, ())}
+        run = self.running(file, lines)
         run = run or {test for tests in of_file.values() for test in tests} or set(self._seconds)
         own = {test for test in self._seconds if f"/test_{Path(file).stem}.py" in test}
         return self._within(run | own, budget, own)
+
+    def running(self, file: str, lines: range) -> set[str]:
+        """Return the tests whose own process runs one of the lines."""
+        of_file = self._lines.get(file, {})
+        return {test for line in lines for test in of_file.get(line, ())}
 
     def but(self, tried: Collection[str], budget: float) -> dict[str, float]:
         """Return further tests in the same way, for values that are computed at import."""
@@ -322,13 +337,23 @@ def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) 
     for number, mutation in enumerate(chosen):
         print(f"\r{number} of {len(chosen)} ", end="", file=sys.stderr, flush=True)
         named = tests.of(mutation.file, mutation.lines, budget)
-        if copy.killed_in_fork(mutation, named) or copy.killed(mutation, named):
-            continue
-        others = tests.but(named, budget)
-        if not others or not copy.killed(mutation, others):
+        if not (
+            copy.killed_in_fork(mutation, named) or _killed_anew(copy, mutation, tests, budget)
+        ):
             alive += 1
             print(f"  alive {mutation.file}:{mutation.line}: {mutation.words}", flush=True)
     return alive
+
+
+def _killed_anew(copy: Copy, mutation: Mutation, tests: Tests, budget: float) -> bool:
+    """Return whether tests fail in a new process on a change that a fork may not have noticed."""
+    if not mutation.at_import and tests.running(mutation.file, mutation.lines):
+        return False
+    named = tests.of(mutation.file, mutation.lines, budget)
+    if copy.killed(mutation, named):
+        return True
+    others = tests.but(named, budget)
+    return bool(others) and copy.killed(mutation, others)
 
 
 def _chosen(room: str, count: int, seed: int, only: str) -> list[Mutation]:

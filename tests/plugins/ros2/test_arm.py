@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import nullcontext
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -111,14 +111,21 @@ class Graph:
         self.closed = True
 
 
-@pytest.fixture
-def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
-    made = Graph()
+G = TypeVar("G", bound=Graph)
+
+
+def put_in(made: G, monkeypatch: pytest.MonkeyPatch) -> G:
+    """Return a graph that stands in for the drivers' bridge and clock."""
     clock = SimpleNamespace(monotonic=made.monotonic, monotonic_ns=made.monotonic_ns)
     for module in ("driver", "listener"):
         monkeypatch.setattr(f"flangeye_plugins.robot.ros2.{module}.time", clock)
     monkeypatch.setattr("flangeye_plugins.robot.ros2.driver.Bridge", lambda asker, sim_time: made)
     return made
+
+
+@pytest.fixture
+def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
+    return put_in(Graph(), monkeypatch)
 
 
 def opened(topic: str = TOPIC, joints: tuple[str, ...] = JOINTS) -> Any:

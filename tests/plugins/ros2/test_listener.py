@@ -5,7 +5,6 @@ The bounds stand here as numbers: a test that took them from the code would foll
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from flangeye_plugins.robot.ros2.driver import (
     robot_ros2_freedrive,
 )
 from flangeye_plugins.ros2.client import GraphMessage
-from tests.plugins.ros2.test_arm import ARM, JOINTS, TOPIC, Graph, refused
+from tests.plugins.ros2.test_arm import ARM, JOINTS, TOPIC, Graph, put_in, refused
 
 TURN = np.eye(6)[0]
 
@@ -54,12 +53,7 @@ class Moving(Graph):
 
 @pytest.fixture
 def graph(monkeypatch: pytest.MonkeyPatch) -> Moving:
-    made = Moving()
-    clock = SimpleNamespace(monotonic=made.monotonic, monotonic_ns=made.monotonic_ns)
-    for module in ("driver", "listener"):
-        monkeypatch.setattr(f"flangeye_plugins.robot.ros2.{module}.time", clock)
-    monkeypatch.setattr("flangeye_plugins.robot.ros2.driver.Bridge", lambda asker, sim_time: made)
-    return made
+    return put_in(Moving(), monkeypatch)
 
 
 def opened(reads_only: bool = True) -> Any:

@@ -120,6 +120,22 @@ def test_of_poses_that_explain_a_scan_alike_the_arms_motion_decides(
     assert sorted(log.finished) == sorted(log.poses)
 
 
+def test_of_poses_of_which_one_alone_fits_that_one_is_taken_and_logged(
+    execute: Callable[..., Any],
+) -> None:
+    def upright(cloud, params):
+        turned = (toy.BASE_T_CAMERA.matrix @ cloud.camera_T_target)[0, 0] < 0
+        return t.Rejected("upside down") if turned else as_segmented(cloud, params)
+
+    with replaced(toy.segment, both_seen(toy.segment.function)), replaced(toy.fit, upright):
+        result, log = execute(TOY_RECIPE)
+    ids = [f"{k:03d}" for k in range(6)]
+    assert [e.capture for e in log.of_kind("fit")] == [o.id for o in result.observations] == ids
+    for observation in log.observations():
+        seen = observation.feature.camera_T_target.matrix
+        assert np.allclose(seen, pose_seen(observation), atol=1e-6)
+
+
 def test_where_the_arms_motion_does_not_tell_the_captures_are_set_aside(
     execute: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -314,6 +330,28 @@ def test_values_survive_the_log_bit_for_bit(execute: Callable[..., Any]) -> None
     assert [o.id for o in log.observations()] == [o.id for o in result.observations]
     for observation, told in zip(log.observations(), result.observations, strict=True):
         assert observation.circle.centre.tolist() == told.centre_in_camera
+
+
+@pytest.mark.parametrize("told", [t.ExpectedError(1e-4, 2e-4), None])
+def test_only_a_solver_that_tells_no_expected_error_gets_the_mixed_models(
+    execute: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, told: t.ExpectedError | None
+) -> None:
+    plain, given, of_model = toy.solve.function, [], t.ExpectedError(3e-4, 4e-4)
+
+    def solve(observations, params):
+        return replace(plain(observations, params), expected=told)
+
+    def verify(calibration, solve, views, params):
+        given.append(calibration.expected)
+        return t.Verification(True, "as it is", {})
+
+    monkeypatch.setattr(
+        "flangeye.estimation.calibrate.with_expected_error",
+        lambda found, *_: replace(found, expected=of_model),
+    )
+    with replaced(toy.solve, solve), replaced(toy.verify, verify):
+        execute(TOY_RECIPE)
+    assert given == [told or of_model]
 
 
 def test_a_refining_step_changes_the_calibration_that_is_verified(
