@@ -1,4 +1,4 @@
-"""Files of runs and batches: they may come from anywhere, so a browser shows them locked in."""
+"""Serve files of runs and batches in a browser sandbox, as they may come from anywhere."""
 
 from __future__ import annotations
 

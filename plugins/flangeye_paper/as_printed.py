@@ -2,9 +2,9 @@
 
 The README of the kind ``weld`` says why, under "As printed".
 
-Three gaps of the print are filled: line 25 adds a scalar to a vector, so ``n_v`` is put beside
-it; line 10 needs a refined path before there is one, so the plan stands in; and the command is
-clipped to what the robot may do, as any robot would.
+Three gaps of the print are filled. Line 25 adds a scalar to a vector; here the scalar is multiplied
+by ``n_v``. Line 10 needs a refined path before one exists; here the plan is used. The command is
+clipped to the robot's limits, as on any robot.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Emulation of the faulty normals of Open3D up to 0.7, on which the paper's ICP ran. Arrays only.
 
-Up to version 0.7 (the data are of 2018-12 to 2019-06) Open3D found the normal of a neighbourhood
-with covariance A as a column of ``(A - l0 I)(A - l1 I)``, l0 >= l1 >= l2 its eigenvalues. Where the
-column belongs to an axis that lies in an exactly flat patch, the product is zero but for rounding,
-and what is left after normalising points anywhere in the patch (isl-org/Open3D issue 880, mended
-in 0.8.0). A CAD cloud's face is such a patch.
+Up to version 0.7 (the data are of 2018-12 to 2019-06) Open3D computed the normal of a neighbourhood
+with covariance A as a column of ``(A - l0 I)(A - l1 I)``, with eigenvalues l0 >= l1 >= l2 of A. In
+an exactly flat patch that is parallel to an axis, such a column is zero except for rounding errors.
+After normalisation it has an arbitrary direction within the patch (isl-org/Open3D issue 880, fixed
+in 0.8.0). A face of a CAD cloud is such a patch.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ def normals_of(points: Floats, radius: float, kind: Normals) -> Floats:
 
 
 def _covariances(points: Floats, radius: float) -> Floats:
-    """Return (N, 3, 3) as mean of products less product of means: the rounding is part of it."""
+    """Return covariances (N, 3, 3) as mean of products minus product of means.
+
+    The rounding error of this formula is part of the emulation.
+    """
     from scipy.spatial import cKDTree
 
     neighbours = 30  # as in the published scripts; their radius is 1 in the file's unit
@@ -116,7 +119,7 @@ class IcpFit:
 def icp(
     source: Floats, target: Floats, normals: Floats, distance: float, stop: IcpStop
 ) -> IcpFit | None:
-    """Point-to-plane ICP as Open3D does it, from the identity; None when too little matches.
+    """Return Open3D's point-to-plane ICP, started at the identity; None if too few points match.
 
     Args:
         source: (N, 3).

@@ -1,11 +1,11 @@
-"""``acquire.published_centres``: the authors' circle centres with what they verified on.
+"""``acquire.published_centres``: the authors' circle centres, with their verification clouds.
 
 ``verify.stored_results_as_in_paper``: compares a calibration with the authors' own results.
 
-For three recordings they stored the 50 matrices that Algorithm 1 ended with, and what ICP gave
-for each. The verification clouds of two of them were never published; but a matrix H and its ICP
-motion T belong together so that H T is where ICP would like the camera to be, whatever H was. From
-H T follows what ICP gives for any other matrix, as far as it converges.
+For three recordings they stored the 50 matrices that Algorithm 1 ended with, and the result of ICP
+for each. The verification clouds of two of them were never published. But the product H T of a
+stored matrix H and its ICP motion T is the camera pose to which ICP converges, whatever H was. From
+H T follows the result of ICP for any other matrix, as far as ICP converges.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The solve step on fresh noise, again and again; and section 3.1's cost, which knows the truth."""
+"""Repeat the solve step on newly drawn noise; and the cost of section 3.1, which uses the truth."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ def verify_realisations(
 ) -> Verification:
     """Repeat acquire.points_as_in_paper and the solve step, and compare with the truth.
 
-    A session a realisation would spend nine tenths of its time on logs and reports. It measures
-    and does not judge: every run passes.
+    One session per realisation would spend nine tenths of its time on logs and reports. The step
+    measures and does not judge: every run passes.
 
-    Figures [m, rad]: ``x_std``, ``x_mean`` and so on for x, y, z, roll, pitch, yaw at the
-    camera's origin, as the paper prints them; ``centre_x_std``, ... at the workspace's centre;
+    Figures [m, rad]: ``x_std``, ``x_mean`` and so on for x, y, z, roll, pitch, yaw at the camera's
+    origin, as the paper prints them; ``centre_x_std``, ... at the workspace's centre;
     ``workspace_rms`` over the workspace; ``inliers_alone_rms`` of least squares on the poses that
     are not outliers; ``bound_x``, ..., ``bound_workspace_rms`` (Cramér-Rao); ``realisations`` and
     how many of them were ``refused``.
@@ -145,10 +145,11 @@ def _summary(figures: dict[str, float]) -> str:
 def error_oracle(
     base_T_camera: Transform, kept: Sequence[Observation], views: Views, flange: Flange | None
 ) -> PoseError:
-    """The distance from the simulation's own truth (17): no method, an emulation of section 3.1.
+    """The error of a candidate against the simulation's truth (17): the cost in section 3.1.
 
-    The paper writes ``e = H^ H_true`` for the error that Algorithm 1 minimises in simulation: the
-    algorithm picks its poses by looking at the answer. No real cell offers that.
+    It emulates the paper and is no method: the paper writes ``e = H^ H_true`` for the error that
+    Algorithm 1 minimises in simulation, so the algorithm selects poses by the answer. In a real
+    cell the truth is unknown.
     """
     at = BASE_T_CAMERA[:3, :3].T @ (WORKSPACE.centre - BASE_T_CAMERA[:3, 3])
     return PoseError(errors_of(base_T_camera.matrix), at, base_T_camera.rotation)

@@ -37,7 +37,7 @@ def error_icp(
 def error_holdout(
     base_T_camera: Transform, kept: Sequence[Observation], views: Views, flange: Flange | None
 ) -> PoseError | None:
-    """The motion that takes circle centres kept from the pool onto their poses; needs no cloud.
+    """The rigid motion from circle centres kept from the pool onto their poses; needs no cloud.
 
     Raises:
         StageError: Fewer than three poses are kept from the pool.

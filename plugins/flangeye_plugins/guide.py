@@ -277,7 +277,7 @@ def with_body(finger: Finger, found: ToolPoints) -> Finger:
     """Return a finger's file with the estimated tip and torch, and their covariances.
 
     The tool's x is the direction from torch to tip, seen along the flange's z, to which its own
-    axis is parallel. What is uncertain of the torch is so relative to the tip.
+    axis is parallel. The torch's standard deviations are those of its position relative to the tip.
     """
     away = found.tip.point - found.torch.point
     direction = float(np.arctan2(away[1], away[0]))

@@ -218,10 +218,10 @@ def _at_best(session: Session) -> Session:
 
 
 def _weak(session: Session, options: Options) -> Floats:
-    """Return the null space (P, k) of the information about the places; see ``unobservable``.
+    """Return the unobservable moves (P, k) of the places; see ``unobservable``.
 
-    The noise is as large as the sightings show, and at least that of a camera and an arm; the arm
-    is taken as reported.
+    The noise is the one estimated from the sightings, but no smaller than that of the best camera
+    and arm. Arm errors common to all poses are left out.
     """
     found = session.found
     model, sizes = found.posterior.model, found.posterior.mode.sizes.copy()

@@ -22,8 +22,8 @@ their non-rigid part; the rigid part stays in the camera's pose."""
 def corrected_part(found: Estimate) -> Floats:
     """Return the (K,) part of the effects' values that a correction removes.
 
-    That is the parameters of the correction. Its smooth error takes up the other displacements of
-    the flange at the session's poses.
+    It consists of the parameters in the correction. Other errors of the arm are included as far as
+    the correction's smooth field reproduces them at the session's poses.
     """
     kept = np.repeat([e.of_arm and e.kind in CORRECTED for e in found.effects], found.counts)
     out = np.where(kept, found.posterior.mean[found.posterior.model.p :], 0.0)

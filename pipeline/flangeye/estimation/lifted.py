@@ -1,14 +1,16 @@
 r"""Squared errors of sightings as one quadratic in lifted features of the unknowns. Arrays only.
 
 A sighting is an equation ``A U B V C = A' U' B' V' C'``, in which each of U, V, U' and V' is one of
-K unknown places, or none. Either side is linear in the entries of V, of U, and in the products of
-U's rotation with V's entries: the features. Squares of the errors, each weighed by its own
-covariance, are then a quadratic ``r' Q r``, with ``r`` a one and all features. U may have several V
-after it; no place may be U here and V there. Without a U the features are V's rotation alone.
-Translations that stand in no product follow from the rest.
+K unknown places, or none. Either side is linear in the features: the entries of V and of U, and the
+products of U's rotation with V's entries. With each error weighted by its own covariance, the sum
+of squared errors is a quadratic ``r' Q r``, where ``r`` consists of 1 and all features. Several V
+may follow the same U, but no place may be U in one equation and V in another. Without a U the
+features are the entries of V's rotation. Translations that are in no product are eliminated by
+their best values.
 
-An error is the turn and shift from one side to the other, in their common frame. Far from the
-answer a turn counts by its sine, and the rest by ``1 - cos`` with the mean weight.
+An error is the rotation and translation from one side to the other, in their common frame. Far from
+the solution a rotation error counts by its sine, and the remainder by ``1 - cos`` with the mean
+weight.
 """
 
 from __future__ import annotations

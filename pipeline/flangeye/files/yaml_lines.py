@@ -1,8 +1,8 @@
-"""Read YAML as people mean it: the 1.2 core types, no surprises, and the line of every value.
+"""Read YAML with the core types of version 1.2, and with the line of every value.
 
-PyYAML follows YAML 1.1, where ``on`` is true, ``012`` is ten, ``1e-3`` is text and the second of
-two equal keys wins in silence. Here those are text, twelve, a number and an error. Tags, anchors
-and aliases are refused, so nothing can be executed and nothing can expand.
+PyYAML follows YAML 1.1: there ``on`` is true, ``012`` is ten, ``1e-3`` is text, and the second of
+two equal keys silently replaces the first. Here these are a text, twelve, a number and an error.
+Tags, anchors and aliases are refused, so nothing is executed and nothing expands.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from flangeye.types import Floats, Indices
 
 
 def distances(offsets: Floats) -> Floats:
-    """Return the (N,) lengths of (N, 2) offsets [m], a sixth of the time of ``np.hypot``."""
+    """Return the (N,) lengths of (N, 2) offsets [m], six times faster than ``np.hypot``."""
     x, y = offsets[:, 0], offsets[:, 1]
     return np.asarray(np.sqrt(x * x + y * y))
 

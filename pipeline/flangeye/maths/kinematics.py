@@ -271,9 +271,10 @@ class Arm:
         return self.inverse_near(base_T_flange, self._starting_points(starts), iterations)
 
     def _polished(self, base_T_flange: Floats, joints: Floats, each: bool = False) -> Floats:
-        """Return the solutions that joints (M, n) near a pose are or lead to.
+        """Return the solutions (K, n) at or near joint angles (M, n) that reach a pose roughly.
 
-        They are refined if none of them reaches the pose; with ``each``, if any does not.
+        Joint angles that miss the pose are refined: only if all of them miss it, or with ``each``,
+        always.
         """
         error = np.abs(self.flange(joints) - base_T_flange).max(axis=(1, 2), initial=0.0)
         solved = error < self.solved

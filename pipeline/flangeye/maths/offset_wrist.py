@@ -245,9 +245,10 @@ def _prepared(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist
 
 
 def _doubtful(values: Floats, change: float) -> Floats:
-    """Return the mask of samples (M, S), without the first and last, beside which roots may hide.
+    """Return the mask of samples (M, S) beside which two roots may lie.
 
-    These are where the equation comes near zero and turns, and where the arm's reach ends.
+    The first and last samples are left out. Two roots without a change of sign between samples may
+    lie at an extremum close to zero, and where the arm's reach ends.
     """
     before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
     size, bent, slope = np.abs(here), before - 2 * here + after, after - before
@@ -262,7 +263,7 @@ def _circle(angles: Floats) -> Floats:
 
 
 def _orbit(axis: Floats, vector: Floats) -> Floats:
-    """Return columns (4, 3) that times (cos, sin, 1) are a vector turned back about an axis."""
+    """Return M (4, 3): M @ (cos a, sin a, 1) is a vector rotated by -a about an axis."""
     along = axis * (axis @ vector)
     return np.vstack([np.array([vector - along, -np.cross(axis, vector), along]).T, np.zeros(3)])
 

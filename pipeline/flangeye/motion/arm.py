@@ -231,7 +231,7 @@ def _alarmed(alarm: Connection) -> Iterator[None]:
         before = signal.set_wakeup_fd(alarm.fileno(), warn_on_full_buffer=False)
         suspending = signal.signal(signal.SIGTSTP, _end_instead)
         try:
-            with _beating():
+            with _heartbeat():
                 yield
         finally:
             signal.signal(signal.SIGTSTP, suspending)
@@ -244,12 +244,13 @@ def _end_instead(*_: object) -> None:
 
 
 @contextmanager
-def _beating() -> Iterator[None]:
-    """Send this process the signal BEAT every EVERY, as long as it runs.
+def _heartbeat() -> Iterator[None]:
+    """Send this process the signal BEAT periodically while the context lasts.
 
-    The interpreter's C handler writes it to the alarm without the interpreter's lock: a long
-    computation is no silence, but being suspended or kept from the processor is. A thread that does
-    nothing else takes the signal, so that it interrupts no call of a device's library.
+    The interpreter's C handler writes each signal to the alarm without the interpreter's lock. So
+    the heartbeat goes on during a long computation, and stops if the process is suspended or
+    starved. A separate thread receives the signals, so that they interrupt no call of a device's
+    library.
     """
     over = threading.Event()
     taker = threading.Thread(target=_take_beats, args=(over,), name="beats", daemon=True)

@@ -191,7 +191,11 @@ class Watchdog:
             )
 
     def _tell_cycle(self, state: RobotState) -> None:
-        """Send the state to a program that waits for it; unasked, a full pipe would block here."""
+        """Send the state to a program that waits for it.
+
+        A state that nobody reads could fill the pipe, and writing to a full pipe would block the
+        guard.
+        """
         if self._asked:
             # Share of a cycle in which a guard that is asked for states waits for the next word
             listening = 0.5
@@ -199,7 +203,7 @@ class Watchdog:
             self._wire.send(Report("cycle", state))
 
     def _keep_led(self) -> None:
-        """Stop an arm whose servoing program sends no commands any more."""
+        """Stop an arm if the program that servos it sends no commands any more."""
         if self._led_ns is None:
             return
         silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
@@ -231,7 +235,7 @@ class Watchdog:
         self._robot.stop()
 
     def _bar(self, reason: str) -> None:
-        """Stop the arm for good: after a safety fault this guard moves it no more."""
+        """Stop the arm permanently: after a safety fault this guard starts no further motion."""
         self._legs, self._led_ns = [], None
         self._supervisor.halted()
         try:

@@ -79,7 +79,7 @@ def session(count: int = 16) -> RecordedSession:
 
 
 class CheckConformance(Conformance):
-    """A ``check`` part: a Session in, Findings out."""
+    """A ``check`` part: takes a recorded session, returns findings."""
 
     kind = "check"
 
@@ -93,12 +93,12 @@ class CheckConformance(Conformance):
         return findings
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal recordings, equal findings."""
+        """Two calls with equal recordings give equal findings."""
         first, again = ([f.what for f in self.found(session())] for _ in range(2))
         require(first == again, "two calls with equal input differ")
 
     def test_it_finds_nothing_where_nothing_is_wrong(self) -> None:
-        """A known cell with 0.05 mm of noise gives no finding above a note."""
+        """Recordings of a known cell with 0.05 mm of noise give no finding of a mistake."""
         mistakes = [finding.what for finding in self.found(session()) if not finding.note]
         require(not mistakes, f"found in good recordings: {'; '.join(mistakes)}")
 
@@ -123,7 +123,7 @@ class CheckConformance(Conformance):
 
 
 class ReplayConformance(Conformance):
-    """A ``replay`` part: a log and a step in, Redone out."""
+    """A ``replay`` part: takes a log and a step, returns the comparison of repeated decisions."""
 
     kind = "replay"
 
@@ -146,7 +146,7 @@ def pose_error(shift: Floats, turn: Floats | None = None) -> t.PoseError:
 
 
 class CostConformance(Conformance):
-    """A ``cost`` part: PoseError in, one number out; less is better."""
+    """A ``cost`` part: takes a PoseError, returns one number; smaller is better."""
 
     kind = "cost"
 
@@ -155,12 +155,12 @@ class CostConformance(Conformance):
         return require_type(self.call(None, error), float)
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal errors, equal costs, to the last bit."""
+        """Two calls with equal errors give equal costs, to the last bit."""
         error = pose_error(np.array([1e-3, 2e-3, -1e-3]), np.array([1e-3, 0, 2e-3]))
         require_repeats(lambda: self.cost(error))
 
     def test_no_error_costs_nothing(self) -> None:
-        """The cost of no error is zero."""
+        """An error of zero has a cost of zero."""
         require(abs(self.cost(pose_error(np.zeros(3)))) < 1e-12, "no error has a cost")
 
     def test_an_error_costs_something(self) -> None:
@@ -183,7 +183,7 @@ class CostConformance(Conformance):
 
 
 class ErrorConformance(Conformance):
-    """An ``error`` part: a candidate pose and poses kept from it in, PoseError or None out."""
+    """An ``error`` part: takes a candidate pose and held-out poses, returns PoseError or None."""
 
     kind = "error"
 
@@ -193,7 +193,7 @@ class ErrorConformance(Conformance):
         return self.call({}, pose, list(kept))
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal input, equal output, to the last bit."""
+        """Two calls with equal input give equal output, to the last bit."""
         require_repeats(lambda: self.measured(TRUE_CAMERA, observed(work_points())))
 
     def test_the_true_pose_has_next_to_no_error(self) -> None:
@@ -202,7 +202,7 @@ class ErrorConformance(Conformance):
         require(off < 0.1e-3, f"the true pose is said to be {1e3 * off:.3f} mm off")
 
     def test_a_candidate_that_is_off_is_off_by_so_much(self) -> None:
-        """A candidate that is 3 mm off has an error of 0.003 m at the work."""
+        """A candidate that is off by 3 mm has an error of 0.003 m at the work."""
         candidate = TRUE_CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
         off = np.linalg.norm(self.measured(candidate, observed(work_points())).displacement())
@@ -222,7 +222,7 @@ class ErrorConformance(Conformance):
 
 
 class ExportConformance(Conformance):
-    """An ``export`` stage: a calibrated pose in, a file out."""
+    """An ``export`` stage: takes a calibrated pose, returns a file."""
 
     kind = "export"
 

@@ -144,7 +144,7 @@ class Conformance:
         )
 
     def test_it_declares_what_it_is(self) -> None:
-        """Its kind, a line of help, and parameters that explain themselves."""
+        """The plugin has a known kind, one line of help, and described parameters."""
         plugin = self.plugin
         kinds = {**KINDS, **PARTS}
         require(plugin.kind in kinds, f"'{plugin.kind}' is not a kind; kinds: {', '.join(kinds)}")

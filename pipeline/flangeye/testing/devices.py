@@ -1,4 +1,4 @@
-"""Drivers (``robot``, ``scanner``, ``sensor``, ``profiler``), a device or its counterpart there."""
+"""Tests of drivers: robots, scanners, sensors, profilers. The device or its emulator must be on."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class RobotConformance(DriverConformance):
     kind = "robot"
 
     def test_it_says_where_it_is(self) -> None:
-        """The sample is recent, in metres, and agrees with the model's kinematics."""
+        """The state is recent, in metres, and agrees with the model's kinematics."""
         with self.opened() as robot:
             require(isinstance(robot, Robot), "it lacks methods of flangeye.devices.Robot")
             state = robot.state()
@@ -124,7 +124,7 @@ class RobotConformance(DriverConformance):
             require(0 < robot.period < 0.1, f"a period of {robot.period} s")
 
     def test_time_goes_on(self) -> None:
-        """Each control cycle gives a new sample, later than the last one."""
+        """Each control cycle gives a new state, later than the last one."""
         with self.opened() as robot:
             first = robot.state().time_ns
             for _ in range(20):
@@ -160,9 +160,10 @@ class RobotConformance(DriverConformance):
             self._until_still(robot)
 
     def test_silence_alone_ends_a_move(self) -> None:
-        """If its state is no longer read it stops within RESTS, before the goal, and stays.
+        """If the state is no longer read, the arm stops within RESTS and stays at rest.
 
-        The program, its guard or the driver's own processes may be frozen, and then let go of.
+        So an arm also stops if the program, its guard or the driver's own process hangs. It does
+        not move on when the process continues.
         """
         with self.opened() as robot:
             start = robot.state().joints
@@ -261,7 +262,7 @@ class ScannerConformance(DriverConformance):
         require(near < depth < far, f"the scan's middle is {depth:.3g} m away: not in metres?")
 
     def test_it_says_its_unit_and_layout(self) -> None:
-        """The device reports its unit and layout, and its clouds have that layout."""
+        """The device states its unit and layout, and its clouds have that layout."""
         with self.opened() as scanner:
             facts = {name.lower(): value for name, value in scanner.facts.items()}
             require(any("unit" in name for name in facts), "facts do not say the device's unit")

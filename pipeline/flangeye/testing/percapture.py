@@ -1,8 +1,7 @@
 """``segment`` and ``fit`` stages: one scan in, one feature out.
 
-Scans whose truth is known: a flange or a ball before a wall, seen by a pinhole camera.
-
-No simulator: rays meet planes and spheres in closed form, so that only the plugin is tested.
+The tests' scans show a flange or a ball before a wall, through a pinhole camera, with known truth.
+They are computed in closed form without a simulator, so that only the plugin is tested.
 """
 
 from __future__ import annotations
@@ -112,7 +111,7 @@ class Scene:
         return Capture("0", cloud, by_frame(Transform(BASE, FLANGE, np.eye(4))))
 
     def flange_cloud(self) -> FlangeCloud:
-        """Return the output of a segment stage: points near the feature, with a rough start."""
+        """Return the output of a segment stage: points near the feature, with a rough centre."""
         points = self.xyz.reshape(-1, 3)
         points = points[np.isfinite(points).all(axis=1)]
         near = np.linalg.norm(points - self.centre, axis=1) < 1.15 * self.radius
@@ -194,7 +193,7 @@ class PerCaptureConformance(Conformance):
     tolerance: ClassVar[float] = 0.1e-3
 
     def scene(self) -> Scene:
-        """Return the scan all checks start from."""
+        """Return the scan that all checks start from."""
         return sphere_scene(BALL) if self.feature == "sphere" else flange_scene(self.flange)
 
     def given(self, scene: Scene) -> dict[Any, Any]:
@@ -223,7 +222,7 @@ class PerCaptureConformance(Conformance):
             require(towards > 0, f"{what}: the normal points away from the scanner")
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal input and seed, equal output, to the last bit."""
+        """Two calls with equal input and seed give equal output, to the last bit."""
         require_repeats(lambda: self.answer()[0])
 
     def test_it_is_right_in_metres_and_in_the_cameras_frame(self) -> None:
@@ -235,11 +234,11 @@ class PerCaptureConformance(Conformance):
         self._require_centre(MOVED, "a scan that was moved")
 
     def test_it_scales_with_the_scene(self) -> None:
-        """A flange a quarter larger and farther away gives a centre scaled likewise."""
+        """A flange that is a quarter larger and farther away gives a centre scaled likewise."""
         self._require_centre(Change(scale=1.25), "a scan that was scaled")
 
     def test_it_follows_a_mirror(self) -> None:
-        """A mirrored scan shows a mirrored flange: its circles are as good."""
+        """A mirrored scan gives a mirrored answer."""
         mirror = Change(np.diag([-1.0, 1.0, 1.0]))
         self._require_centre(mirror, "a scan that was mirrored")
 
@@ -249,7 +248,7 @@ class PerCaptureConformance(Conformance):
 
 
 class SegmentConformance(PerCaptureConformance):
-    """A ``segment`` stage: Capture in, FlangeCloud or Rejected out."""
+    """A ``segment`` stage: takes a Capture, returns a FlangeCloud or Rejected."""
 
     kind = "segment"
     tolerance = 5e-3
@@ -285,7 +284,7 @@ class SegmentConformance(PerCaptureConformance):
 
 
 class FitConformance(PerCaptureConformance):
-    """A ``fit`` stage that works on a FlangeCloud; one for markers overrides :meth:`given`."""
+    """A ``fit`` stage for a FlangeCloud; a stage for markers overrides :meth:`given`."""
 
     kind = "fit"
 

@@ -88,7 +88,7 @@ def reference_solution(observations: Sequence[t.Observation]) -> t.HandEye:
 
 
 def elsewhere(observations: Sequence[t.Observation], motion: Floats) -> list[t.Observation]:
-    """Return the same scans for a robot whose base is at another place."""
+    """Return the same scans, taken by a robot whose base is at another place."""
     moved = t.Transform(t.BASE, t.BASE, motion)
     return [replace(o, poses={**o.poses, t.FLANGE: moved @ o.base_T_flange}) for o in observations]
 
@@ -113,7 +113,7 @@ class SolvingConformance(Conformance):
         return t.Views([t.VerificationView("view", cloud, pose)])
 
     def stream(self, observations: Sequence[t.Observation]) -> t.Observations:
-        """Return observations as the steps before give them."""
+        """Return observations as the earlier steps of a recipe would give them."""
         workspace = t.Box(WORK, WORK_SIZE)
         source = t.Source("kit", workspace=workspace)
         return t.Observations(observations, source, len(observations))
@@ -135,16 +135,16 @@ class SolvingConformance(Conformance):
         require_close(found.apply(corners), true.apply(corners), within, f"{what}: the work [m]")
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal input and seed, equal output, to the last bit."""
+        """Two calls with equal input and seed give equal output, to the last bit."""
         require_repeats(lambda: self.answer(observed(work_points())))
 
     def test_its_answer_survives_the_log(self) -> None:
-        """Written to MCAP and read back, it is the same."""
+        """The answer is unchanged after it is written to MCAP and read back."""
         require_round_trip(self.answer(observed(work_points())))
 
 
 class SolveConformance(SolvingConformance):
-    """A ``solve`` stage: Observations in, HandEye out.
+    """A ``solve`` stage: takes observations, returns a HandEye.
 
     Attributes:
         tolerance: Largest error at the work with 0.05 mm of noise at 16 poses [m].
@@ -158,12 +158,12 @@ class SolveConformance(SolvingConformance):
         return self.known(observations, motion)
 
     def test_it_finds_the_camera_in_metres(self) -> None:
-        """A known cell with 0.05 mm of noise."""
+        """The camera's pose in a known cell with 0.05 mm of noise is found, in metres."""
         answer = self.answer(observed(work_points()))
         self._require_pose(answer, TRUE_CAMERA, self.tolerance, "a known cell")
 
     def test_it_accounts_for_every_observation(self) -> None:
-        """One pair for each observation, with correct residuals."""
+        """The result has one pair for each used or unused observation, with its residual."""
         observations = observed(work_points())
         answer = self.answer(observations)
         ids = [pair.observation.id for pair in answer.pairs]
@@ -180,7 +180,7 @@ class SolveConformance(SolvingConformance):
             require(pair.used or pair.reason, f"{pair.observation.id} is unused without a reason")
 
     def test_its_covariance_is_one(self) -> None:
-        """Symmetric, no negative variance."""
+        """The covariance is symmetric and has no negative variance."""
         answer = self.answer(observed(work_points()))
         require_covariance(answer.camera.covariance, "the pose's covariance")
 
@@ -191,21 +191,21 @@ class SolveConformance(SolvingConformance):
         self._require_pose(self.answer(moved), MOTION @ TRUE_CAMERA, within, "a base elsewhere")
 
     def test_it_scales_with_the_cell(self) -> None:
-        """Everything a quarter larger."""
+        """The camera's pose in a cell that is a quarter larger is found."""
         camera = TRUE_CAMERA.copy()
         camera[:3, 3] *= 1.25
         answer = self.answer(observed(1.25 * work_points(), camera))
         self._require_pose(answer, camera, 1.25 * self.tolerance, "a larger cell")
 
     def test_it_never_gives_a_mirror_image(self) -> None:
-        """Centres in one plane fit their mirror image too: only a proper rotation is a pose."""
+        """Centres in one plane, which also fit their mirror image, give a proper rotation."""
         points = work_points()
         points[:, 2] = WORK[2]
         answer = self.answer(observed(points, noise=NOISE / 5))
         self._require_pose(answer, TRUE_CAMERA, self.tolerance, "centres in one plane")
 
     def test_too_little_is_refused(self) -> None:
-        """Two poses, all poses at one place, centres on a line."""
+        """Two poses, poses at one place and centres on a line are refused."""
         along = np.linspace(-0.5, 0.5, POSES)[:, None] * [0.3, 0.0, 0.0]
         for what, points in (
             ("two poses", work_points(2)),
@@ -217,7 +217,7 @@ class SolveConformance(SolvingConformance):
 
 
 class RefineConformance(SolvingConformance):
-    """A ``refine`` stage: HandEye in, HandEye out.
+    """A ``refine`` stage: takes a HandEye, returns a HandEye.
 
     Attributes:
         tolerance: Largest error at the work after refining a good calibration [m].
@@ -239,23 +239,23 @@ class RefineConformance(SolvingConformance):
 
 
 class VerifyConformance(SolvingConformance):
-    """A ``verify`` stage: HandEye in, Verification out."""
+    """A ``verify`` stage: takes a HandEye, returns a Verification."""
 
     kind = "verify"
     gives = t.Verification
 
     def test_it_passes_a_good_calibration(self) -> None:
-        """A known cell with 0.05 mm of noise."""
+        """The calibration of a known cell with 0.05 mm of noise passes."""
         answer = self.answer(observed(work_points()))
         require(answer.passed, f"a good calibration fails: {answer.reason}")
 
     def test_it_fails_a_bad_calibration(self) -> None:
-        """Centres that are off by 20 mm, each elsewhere."""
+        """A calibration from centres with 20 mm of noise fails."""
         answer = self.answer(observed(work_points(), noise=20e-3))
         require(not answer.passed, f"a calibration with 20 mm of noise passes: {answer.reason}")
 
     def test_it_says_what_it_measured(self) -> None:
-        """One line with the figure and the limit; figures and errors that are numbers."""
+        """The reason is one line with a figure; all figures and errors are finite numbers."""
         answer = self.answer(observed(work_points()))
         require(answer.reason and "\n" not in answer.reason, "the reason is one line")
         require(any(c.isdigit() for c in answer.reason), "the reason names no figure")

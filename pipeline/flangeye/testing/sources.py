@@ -38,7 +38,7 @@ SOURCE_CAMERA = rigid(rotation_exp(np.array([np.pi, 0.0, 0.0])), np.array([0.5, 
 
 
 class AcquireConformance(Conformance):
-    """An ``acquire`` stage: a lazy stream of captures, or of observations.
+    """An ``acquire`` stage: returns a lazy stream of captures or of observations.
 
     Attributes:
         archive: Recordings to run on, if the stage needs any.
@@ -61,7 +61,7 @@ class AcquireConformance(Conformance):
         return stream, items
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal input and seed, equal captures, to the last bit."""
+        """Two calls with equal input and seed give equal captures, to the last bit."""
         (first, some), (again, same) = self.acquired(), self.acquired()
         require(first.source.fingerprint, "the source has no fingerprint")
         require(
@@ -125,7 +125,7 @@ def logged(capture: t.Capture) -> t.Capture:
 
 
 class ReaderConformance(Conformance):
-    """A ``reader`` part: a path in, an Archive out.
+    """A ``reader`` part: takes a path, returns an Archive.
 
     Attributes:
         archive: A folder or file in the reader's layout.
@@ -139,7 +139,7 @@ class ReaderConformance(Conformance):
         return require_type(self.call({}, path or self.archive), Archive)
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal files, equal recordings, in equal order."""
+        """Reading equal files twice gives equal recordings in equal order."""
         first, again = ([_traits(r) for r in self.read().recordings] for _ in range(2))
         require(first == again, "two readings differ")
 
@@ -168,7 +168,7 @@ def _traits(recording: Any) -> tuple[Any, ...]:
 
 
 class PlanConformance(Conformance):
-    """A ``plan`` part: a site and a random generator in, poses to visit out."""
+    """A ``plan`` part: takes a site and a random generator, returns poses to visit."""
 
     kind = "plan"
 
@@ -192,7 +192,7 @@ class PlanConformance(Conformance):
         return np.array(found)
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Its only randomness is the given generator."""
+        """Two plans with equal random generators are equal."""
         require(np.array_equal(self.poses(3), self.poses(3)), "two plans with one seed differ")
 
     def test_its_poses_are_poses_inside_its_box(self) -> None:
@@ -204,7 +204,7 @@ class PlanConformance(Conformance):
             require((outside < 1e-6).all(), f"a pose is {outside.max():.3g} m outside the box")
 
     def test_its_poses_tell_the_camera(self) -> None:
-        """Three poses or more, not on a line, so that the camera is observable."""
+        """The plan has three poses or more, not on a line, so that the camera is observable."""
         centres = self.poses()[:, :3, 3]
         require(len(centres) >= 3, f"{len(centres)} poses, 3 are needed")
         spread = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
@@ -217,7 +217,7 @@ class PlanConformance(Conformance):
         require_close(there[:, :3, 3], here[:, :3, 3] + shift, 1e-6, "a pose of a moved site [m]")
 
     def test_a_site_that_shows_nothing_is_no_crash(self) -> None:
-        """If the arm cannot show its flange anywhere, the plan is empty or gives the reason."""
+        """If the arm cannot show its flange anywhere, the plan is empty or is refused."""
         site = Site(
             centre=np.zeros(3), eye=np.ones(3), facing=lambda p: None, joints=lambda p: None
         )
@@ -238,7 +238,7 @@ def _facing(point: Floats, eye: Floats) -> Floats:
 
 
 class ViewConformance(Conformance):
-    """A ``view`` part: the scanner's pose before any scan."""
+    """A ``view`` part: returns the scanner's pose before any scan."""
 
     kind = "view"
 
@@ -247,11 +247,11 @@ class ViewConformance(Conformance):
         return np.asarray(self.call({}, Arm(self.robot), self.scanner), dtype=float)
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal input, equal guess, to the last bit."""
+        """Two calls with equal input give equal guesses, to the last bit."""
         require(np.array_equal(self.guess(), self.guess()), "two guesses differ")
 
     def test_it_is_a_pose_in_metres(self) -> None:
-        """``base_T_camera``, rigid, in a cell's size."""
+        """The guess is a rigid ``base_T_camera`` in metres, within a cell's size."""
         pose = self.guess()
         t.Transform(t.BASE, t.CAMERA, pose)
         far = float(np.linalg.norm(pose[:3, 3]))

@@ -43,22 +43,22 @@ class OnceConformance(Conformance):
         return require_type(value, self.gives)
 
     def test_it_gives_the_same_twice(self) -> None:
-        """Equal input and seed, equal output, to the last bit."""
+        """Two calls with equal input and seed give equal output, to the last bit."""
         require_repeats(self.answer)
 
     def test_its_answer_survives_the_log(self) -> None:
-        """Written to MCAP and read back, it is the same."""
+        """The answer is unchanged after it is written to MCAP and read back."""
         require_round_trip(self.answer())
 
 
 class ScanConformance(OnceConformance):
-    """A ``scan`` stage: a WorkpieceScan out."""
+    """A ``scan`` stage: returns a WorkpieceScan."""
 
     kind = "scan"
     gives = t.WorkpieceScan
 
     def test_its_points_are_in_the_camera_in_metres(self) -> None:
-        """In the scanner's frame and within its range."""
+        """The scan's points are in the scanner's frame and within its range, in metres."""
         cloud = self.answer().cloud
         require(cloud.frame == t.CAMERA, f"the cloud is in '{cloud.frame}', not in '{t.CAMERA}'")
         depth = float(np.median(np.linalg.norm(cloud.points(), axis=1)))
@@ -67,25 +67,25 @@ class ScanConformance(OnceConformance):
 
 
 class SeamConformance(OnceConformance):
-    """A ``seam`` stage: a Seam in the robot's base out."""
+    """A ``seam`` stage: returns a Seam in the robot's base."""
 
     kind = "seam"
     gives = t.Seam
 
     def test_it_lies_in_the_cell_in_metres(self) -> None:
-        """Not in the camera's frame, not in millimetres."""
+        """The seam lies in the robot's base, within the cell, in metres."""
         far = float(np.linalg.norm(self.answer().points_in_base - TRUE_CAMERA[:3, 3], axis=1).max())
         limit = 5 * self.scanner.far
         require(far < limit, f"the seam is {far:.3g} m from the camera, which sees {limit / 5:.3g}")
 
     def test_its_covariances_are_covariances(self) -> None:
-        """Symmetric, no negative variance."""
+        """Each point's covariance is symmetric and has no negative variance."""
         for matrix in self.answer().covariance:
             require_covariance(matrix, "a point's covariance")
 
 
 class WeldConformance(OnceConformance):
-    """A ``weld`` stage: a WeldReport out."""
+    """A ``weld`` stage: returns a WeldReport."""
 
     kind = "weld"
     gives = t.WeldReport
@@ -103,10 +103,10 @@ def straight_task() -> FollowingTask:
 
 
 class ControllerConformance(Conformance):
-    """A ``controller`` part: poses and touches in, one command per cycle out.
+    """A ``controller`` part: takes poses and touches, returns one command per cycle.
 
-    The test moves the tool along the plan for ten seconds with the requested deflection; the
-    commands' path is not judged.
+    The test moves the tool along the plan for ten seconds with the requested deflection. It does
+    not judge the path that the commands describe.
     """
 
     kind = "controller"
@@ -127,12 +127,12 @@ class ControllerConformance(Conformance):
         return given
 
     def test_it_commands_the_same_twice(self) -> None:
-        """Equal input, equal commands, to the last bit."""
+        """Two runs with equal input give equal commands, to the last bit."""
         first, again = ([(*c.velocity, c.turn) for c in self.commands()] for _ in range(2))
         require(first == again, "two runs with equal input differ")
 
     def test_its_commands_are_finite_and_turn_no_faster_than_allowed(self) -> None:
-        """Three velocities [m/s] and a turn [rad/s], in every cycle."""
+        """Every command has three finite velocities [m/s] and an allowed turn rate [rad/s]."""
         limit = straight_task().turn_rate
         for command in self.commands():
             require(

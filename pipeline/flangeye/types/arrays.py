@@ -90,7 +90,7 @@ class Warn(str):
         return made
 
     def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
-        """Travel to another process whole."""
+        """Return the text and the fix, so that pickling keeps both."""
         return str(self), self.fix
 
 

@@ -20,7 +20,7 @@ def arc_lengths(points: Floats) -> Floats:
 
 
 def rows_at(at: ArrayLike, known: Floats, rows: Floats) -> Floats:
-    """Interpolate the rows (N, ...) that stand at ``known`` (N,), rising, at (M,): (M, ...)."""
+    """Return ``rows`` (N, ...), given at ascending ``known`` (N,), interpolated at ``at`` (M,)."""
     columns = rows.reshape(len(rows), -1).T
     there = np.stack([np.interp(np.asarray(at), known, column) for column in columns], axis=-1)
     return there.reshape((*np.shape(at), *rows.shape[1:]))

@@ -138,7 +138,7 @@ class Looks(Shape):
 
     @cached_property
     def symmetry(self) -> Symmetry:
-        """The turns that leave the body as it is: of a cylinder about its axis, of a ball all."""
+        """Rotations that leave the body unchanged: a cylinder's about its axis, all of a ball's."""
         points = np.concatenate([self.surface.points, self.ends.points])
         values, _ = self._held(points, np.concatenate([self.surface.normals, self.ends.directions]))
         # Share of the body's points that show a direction: of facets of a cylinder fewer
@@ -160,14 +160,14 @@ class Looks(Shape):
     def _held(
         self, points: Floats, directions: Floats, weights: Floats | float = 1.0
     ) -> tuple[Floats, Floats]:
-        """Return by how much points hold each direction of the pose (6,), and those (6, 6)."""
+        """Return eigenvalues (6,) and eigenvectors (6, 6) of the information about a pose."""
         place = (points - self.centre) / self.size
         jacobian = np.hstack([np.cross(place, directions), directions])
         weighted = jacobian * np.reshape(weights, (-1, 1))
         return np.linalg.eigh(weighted.T @ jacobian / len(points))
 
     def twins(self, pose: Floats) -> Floats:
-        """Return poses (K, 4, 4) turned by a cube's rotations, which often look alike."""
+        """Return a pose turned by the rotations of a cube (K, 4, 4), which often look alike."""
         middle = self.surface.points.mean(axis=0)
         out = np.tile(np.eye(4), (len(QUARTERS), 1, 1))
         out[:, :3, :3] = QUARTERS

@@ -202,7 +202,7 @@ def exchanged(session: RecordedSession) -> Findings:
     """
     session.require_poses()
     if not np.isfinite(session.rotations).any() or not _may_be_mounted_otherwise(session):
-        raise NotApplicable("camera and target cannot stand for each other")
+        raise NotApplicable("it needs one arm, and whole poses of a target at an unknown place")
     if not explained(session) or Reading() in (readings := _likely_readings(session)):
         return
     carried, standing = _distances(session)
@@ -313,7 +313,7 @@ def _transposed_markers(session: RecordedSession) -> Iterator[tuple[RecordedSess
 
 
 def _may_be_mounted_otherwise(session: RecordedSession) -> bool:
-    """Whether inverted poses cannot be told from camera and target mounted the other way round."""
+    """Whether inverted poses have the same equations as other mountings of camera and target."""
     unknown = not np.isfinite(session.places).any()
     return session.links is None and session.seconds is None and unknown
 

@@ -61,7 +61,7 @@ def _dual(motions: Floats) -> tuple[Floats, Floats]:
 
 
 def _ratios(a: float, b: float, c: float) -> list[tuple[float, float]]:
-    """Return the (s, t) with ``a s^2 + b s t + c t^2 = 0``: real part across the dual."""
+    """Return the (s, t) with ``a s^2 + b s t + c t^2 = 0``: real part orthogonal to dual part."""
     discriminant = b * b - 4.0 * a * c
     if discriminant < 0.0:
         # Noise may leave the parabola short of zero: its vertex is the nearest.
@@ -95,9 +95,9 @@ def shah(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
 def li(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
     """Return X and Z (4, 4) of ``G X = Z inv(M)``: Li, Wang & Wu, Int. J. Phys. Sci. 5(10), 2010.
 
-    One linear system for all 24 entries, written for the inverses (``M inv(Z) = inv(X) inv(G)``,
-    whose translations are the camera's, the noisier side); the rotations are then made orthonormal
-    and, as Shah points out one must, the translations fitted to them again.
+    One linear system for all 24 entries. It is written for the inverses, ``M inv(Z) = inv(X)
+    inv(G)``, whose translations are the camera's, the noisier side. The rotations are then made
+    orthonormal and the translations fitted to them again, as Shah shows to be necessary.
 
     Args:
         carried: (N, 4, 4) G, target_carrier_T_camera_carrier.

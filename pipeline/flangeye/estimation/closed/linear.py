@@ -1,4 +1,4 @@
-"""Equations that are linear in a rotation's entries and in shifts, of K problems at once."""
+"""Linear equations in the entries of rotations and in translations, for K problems at once."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ def entries(before: Floats, points: Floats) -> Floats:
 
 
 def least_squares(*systems: tuple[list[Floats], Floats]) -> Floats:
-    """Return what solves equations: blocks (K, N, 3, .) of their rows, and right sides (K, N, 3).
+    """Return the least-squares solutions (K, .) of K systems of equations.
 
-    Where the right side is NaN there is no equation.
+    The rows are in blocks (K, N, 3, .), one block for each group of unknowns; right sides are (K,
+    N, 3). A row whose right side is NaN does not count.
     """
     leads = [each.shape[:2] for parts, right in systems for each in (*parts, right)]
     k, n = np.broadcast_shapes(*leads)

@@ -19,9 +19,9 @@ from flangeye.types.geometry import (
 def tsai_lenz(motions: Motions) -> Floats:
     """Return X (4, 4): Tsai & Lenz, IEEE Trans. Robotics and Automation 5(3), 1989, eq. (10)-(15).
 
-    Their vector ``2 sin(angle / 2) axis`` cannot express half a turn. X is therefore looked for
-    with the camera turned beforehand by nothing and by half a turn about each of its axes; the
-    best conditioned of the four systems is the one whose X turns least.
+    Their vector ``2 sin(angle / 2) axis`` cannot express a rotation by 180 degrees. So the system
+    is set up four times: with the camera's frame as it is, and rotated by 180 degrees about each of
+    its axes. The best conditioned system is solved: there X rotates least.
     """
     a, b = _half_sines(motions.alpha), _half_sines(motions.beta)
     # No turn, and half a turn about each axis

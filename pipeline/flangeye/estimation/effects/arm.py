@@ -111,7 +111,7 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
             # to says nothing of how true it is: it has a quality of its own
             out.append(Scatter(_backlash(arm), 0.1 * accuracy, QUALITY, ""))
         else:
-            turns, shifts = (_anew(arm, rows) for rows in (slice(3), slice(3, 6)))
+            turns, shifts = (_pose_noise(arm, rows) for rows in (slice(3), slice(3, 6)))
             turned, shifted = ANEW["each"]
             out.append(Scatter(turns, turned * accuracy, QUALITY_SPREAD, arm))
             out.append(Scatter(shifts, shifted * accuracy, QUALITY_SPREAD, arm))
@@ -137,8 +137,8 @@ def _backlash(arm: str) -> Callable[[Problem, Linear], Floats]:
     return covariances
 
 
-def _anew(arm: str, rows: slice) -> Callable[[Problem, Linear], Floats]:
-    """Return an arm's noise: shifts of its carriers, or turns with the target as lever."""
+def _pose_noise(arm: str, rows: slice) -> Callable[[Problem, Linear], Floats]:
+    """Return a function: covariances of sightings for unit noise of an arm's poses in ``rows``."""
 
     def covariances(problem: Problem, linear: Linear) -> Floats:
         moved = [linear.blocks[c.frame][:, :, rows] for c in problem.carriers if c.arm == arm]

@@ -1,9 +1,9 @@
-"""Point cloud files: PCD, PLY, NumPy arrays and plain text, read strictly and without surprises.
+"""Read point cloud files strictly: PCD, PLY, NumPy arrays and plain text.
 
 A damaged file is refused, never repaired. Its header is checked against its size before memory is
 allocated, so a header that states a billion points costs nothing. Points that are not finite are
-kept, as missing points, so that organised clouds keep their grid; a file of nothing but missing
-points is a valid file.
+kept as missing points, so that organised clouds keep their grid. A file with nothing but missing
+points is valid.
 """
 
 from __future__ import annotations

@@ -307,7 +307,7 @@ class Check(Protocol):
     """How a ``check`` part is called."""
 
     def __call__(self, session: RecordedSession) -> Iterable[Finding]:
-        """Return the mistakes that it can defend; raise :class:`NotApplicable` to abstain."""
+        """Return the significant mistakes; raise :class:`NotApplicable` if it cannot judge."""
 
 
 @dataclass(frozen=True, eq=False)

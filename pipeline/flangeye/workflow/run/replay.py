@@ -1,4 +1,4 @@
-"""Decisions made again from the log of the step that made them."""
+"""Repeat the decisions of a step from its log, and compare them with the logged ones."""
 
 from __future__ import annotations
 

@@ -394,7 +394,7 @@ class Runner:
             self._values[t.VerifiedHandEye] = self._outcome.calibration = verified
 
     def _export(self) -> None:
-        """Write the pose in other programs' words; a refused one never gets here."""
+        """Write the pose in other programs' formats; a refused calibration ends the run before."""
         steps = self._steps("export")
         if steps:
             so_far = result_of(self._outcome, self._recipe, self._registry, self._watch)

@@ -257,8 +257,8 @@ class Contact:
     def _let_go(self, deflection: float) -> float:
         """Return the likelihood of a deflection [m], given that the tip is free.
 
-        The tip of a released finger shows no deflection, or the play through which it has not
-        returned, or whatever friction drags it by.
+        A released finger shows no deflection, its remaining play, or the displacement that friction
+        causes.
         """
         noise, play = self.noise[0] ** 2, self.play
         held = _normal(deflection, noise) + _normal(deflection - play, noise + (0.3 * play) ** 2)

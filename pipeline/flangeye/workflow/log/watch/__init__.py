@@ -298,7 +298,7 @@ async def _serve(
 
 
 def may_look(head: bytes) -> bool:
-    """Return whether a request is a program's, or that of Foxglove's page or desktop files."""
+    """Return whether a request may connect: a web page may only if it is Foxglove's own."""
     lines = head.decode("latin-1").split("\r\n")[1:]
     told = [
         v.strip()
