@@ -1,8 +1,8 @@
 """Record which test runs which line: python -m tools.covering SOURCE OUT TESTS…
 
 The fast tests of each file (or, without any, those in real time) run once under coverage.py, each in
-its own context. OUT (JSON) gets, for each file of tests, the processor time of every passing test,
-and for each file and line of the source the tests that run it.
+its own context. OUT (JSON) gets, for each file of tests, the time that every passing test takes, and
+for each file and line of the source the tests that run it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,17 @@ NAMED = ("-q", "-p", "no:cacheprovider", "-m", "not slow")
 
 
 class Covering:
-    """A pytest plugin that tells coverage.py which test runs."""
+    """A pytest plugin that tells coverage.py which test runs.
+
+    Attributes:
+        seconds: What each test takes [s].
+        clock: By which: of this process, or of the wall for tests that wait for other processes.
+    """
 
     def __init__(self, source: Path) -> None:
         self._coverage = coverage.Coverage(data_file=None, source=[str(source)], config_file=False)
         self.seconds: dict[str, float] = {}
+        self.clock = time.process_time
         self._failed: set[str] = set()
         self._coverage.start()  # from the first import on
 
@@ -34,11 +40,11 @@ class Covering:
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
         """Name the context after the test."""
         self._coverage.switch_context(item.nodeid)
-        began = time.process_time()
+        began = self.clock()
         try:
             return (yield)
         finally:
-            self.seconds[item.nodeid] = time.process_time() - began
+            self.seconds[item.nodeid] = self.clock() - began
             self._coverage.switch_context("")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -77,6 +83,7 @@ def main() -> Any:
     code = pytest.main([*NAMED[:-1], "not slow and not realtime", *tests], plugins=[plugin])
     fast = {_file_of(test) for test in plugin.seconds}
     if others := [file for file in tests if file not in fast]:
+        plugin.clock = time.monotonic
         code = max(code, pytest.main([*NAMED, *others], plugins=[plugin]))
     Path(out).write_text(json.dumps(plugin.gathered(tests)), "utf-8")
     return code

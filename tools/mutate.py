@@ -62,8 +62,9 @@ KEPT = ROOT / "build" / "mutation"
 COMPARED = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
             ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is}  # fmt: skip
 COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
-SLOWER, STARTS = 4.0, 8.0
-"""A change is noticed, too, by tests that take so many times as long, and so much more [CPU s]."""
+SLOWER, STARTS, FORKS = 4.0, 8.0, 3.0
+"""A change is noticed, too, by tests that take so many times as long, and so much more: in a new
+process, and in a fork that has all imported [CPU s]."""
 IDLE = 3.0
 """Or by tests that wait so many times longer than that, on a machine that is not crowded [wall s a
 CPU s]."""
@@ -250,7 +251,7 @@ class Copy:
     def killed_in_fork(self, mutation: Mutation, tests: dict[str, float]) -> bool:
         """Return whether a changed function fails tests in a fork of the collecting process."""
         assert self._trying is not None and self._trying.stdin and self._trying.stdout
-        bounds = {test: SLOWER * seconds + STARTS for test, seconds in tests.items()}
+        bounds = {test: SLOWER * seconds + FORKS for test, seconds in tests.items()}
         asked = {"code": mutation.code(self._root), "tests": bounds, "idle": _idle()}
         print(json.dumps(asked), file=self._trying.stdin, flush=True)
         if not (answer := self._trying.stdout.readline()):

@@ -326,6 +326,15 @@ def test_a_body_is_shown_by_most_of_what_faces_the_camera(body: str) -> None:
         assert mesh.vertices[:, 2].min() > 0
 
 
+def test_a_flat_body_turns_its_broad_side_to_the_camera_not_to_a_projector_aside() -> None:
+    lean = np.radians(40.0)  # the axes meet where the body is shown
+    aside = {"baseline": 1.4 * np.sin(lean), "convergence": lean}
+    eye = scanner(near=0.1, far=9.0, field_of_view=np.radians([100.0, 100.0]), **aside)
+    arm = Reach(MODEL, eye, OVERHEAD, load_body("ring-plate", None, Path()))
+    assert arm.facing(AHEAD) is not None
+    assert np.abs(arm.shown) == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
+
+
 def test_a_body_out_of_the_field_or_behind_the_arm_is_refused() -> None:
     wide = {"near": 0.1, "far": 9.0}
     for turn, field, shown in ((0.0, 60.0, True), (0.0, 2.0, False), (np.pi, 60.0, False)):

@@ -4,17 +4,30 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
 
 from flangeye import types as t
 from flangeye.plugin.registry import Registry
-from flangeye.workflow.log.foxglove import CLOUD_TOPICS, foxglove_layout, points_of
+from flangeye.workflow.log.foxglove import (
+    CLOUD_TOPICS,
+    circle_points,
+    circle_scene,
+    compressed_image,
+    foxglove_layout,
+    point_cloud,
+    points_of,
+    seam_poses,
+    seam_scene,
+)
 from flangeye.workflow.log.record import Recorder
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.folder import RunFolder
@@ -111,3 +124,89 @@ def test_a_rerun_blueprint_is_that_of_the_logs_name(tmp_path: Path) -> None:
 def test_another_viewer_is_not_known(flangeye: Any) -> None:
     code, _, err = flangeye("layout", "rviz")
     assert (code, err) == (2, "error: no layout for 'rviz'; known: foxglove, rerun\n")
+
+
+# --- what is drawn, by numbers --------------------------------------------------------------------
+
+CIRCLE = t.CircleFeature(
+    np.array([0.1, 0.2, 0.9]), np.array([0.0, 0.6, -0.8]), {"rim": 0.03, "bore": 0.016},
+    1e-8 * np.eye(3), 1e-8 * np.eye(3), 1.0,
+)  # fmt: skip
+SEAM = t.Seam(
+    np.array([[0.5, 0.0, 0.1], [0.5, 0.2, 0.1], [0.5, 0.4, 0.1]]), np.tile([0.0, 0.0, 1.0], (3, 1)),
+    1e-8 * np.tile(np.eye(3), (3, 1, 1)),
+)  # fmt: skip
+
+
+def drawn(update: Any, frame: str) -> list[Any]:
+    """Return the lines (N, 3) of a scene in a frame, after a look at how they are shown."""
+    (entity,) = update.entities
+    assert (entity.frame_id, entity.timestamp.ToNanoseconds()) == (frame, 5)
+    for line in entity.lines:
+        assert line.scale_invariant and line.thickness >= 1.0 and line.color.a == 1.0
+        assert max(line.color.r, line.color.g, line.color.b) <= 1.0
+        assert line.pose.orientation.w == 1.0
+    return [np.array([[p.x, p.y, p.z] for p in line.points]) for line in entity.lines]
+
+
+def require_ring(ring: Any, centre: Any, axis: Any, radius: float, points: int) -> None:
+    """Check that points lie evenly on a whole circle, the last of them on the first."""
+    out, steps = ring - centre, np.linalg.norm(np.diff(ring, axis=0), axis=1)
+    np.testing.assert_allclose(out @ axis, 0.0, atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), radius, atol=1e-7)
+    np.testing.assert_allclose(steps, 2 * radius * np.sin(np.pi / (points - 1)), atol=1e-6)
+    np.testing.assert_allclose(ring[0], ring[-1], atol=1e-7)
+
+
+def test_a_circle_is_drawn_as_a_ring_for_each_radius_and_three_centimetres_of_its_normal() -> None:
+    assert circle_scene("7", CIRCLE, 5).entities[0].id == "circle/7"
+    rim, bore, normal = drawn(circle_scene("7", CIRCLE, 5), "camera")
+    for ring, radius in ((rim, 0.03), (bore, 0.016)):
+        require_ring(ring, CIRCLE.centre, CIRCLE.normal, radius, 73)
+    np.testing.assert_allclose(normal[0], CIRCLE.centre)
+    np.testing.assert_allclose(normal[1] - normal[0], 0.03 * CIRCLE.normal, atol=1e-12)
+
+
+def test_a_circle_s_points_are_dense_and_without_a_normal_its_centre_alone() -> None:
+    points = points_of(circle_points(CIRCLE, 5))
+    require_ring(points[:361], CIRCLE.centre, CIRCLE.normal, 0.03, 361)
+    require_ring(points[361:722], CIRCLE.centre, CIRCLE.normal, 0.016, 361)
+    assert len(points) == 724
+    bare = replace(CIRCLE, normal=None, normal_covariance=None)
+    np.testing.assert_allclose(points_of(circle_points(bare, 5)), CIRCLE.centre[None], atol=1e-7)
+
+
+def test_a_seam_is_drawn_with_rings_about_it_and_its_poses_lead_along_and_into_the_groove() -> None:
+    line, *rings = drawn(seam_scene(SEAM, 5), "base")
+    np.testing.assert_allclose(line, SEAM.points_in_base)
+    assert [round(float(ring[:, 1].mean()), 9) for ring in rings] == [0.0, 0.2, 0.4]
+    poses = seam_poses(SEAM, 5)
+    assert (poses.frame_id, poses.timestamp.ToNanoseconds()) == ("base", 5)
+    for pose, point in zip(poses.poses, SEAM.points_in_base, strict=True):
+        at, q = pose.position, pose.orientation
+        assert [at.x, at.y, at.z] == point.tolist()
+        turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        np.testing.assert_allclose(turn[:, [0, 2]].T, [[0, 1, 0], [0, 0, -1]], atol=1e-9)
+
+
+def test_a_cloud_s_points_stand_in_its_frame_as_three_floats_each() -> None:
+    xyz = np.arange(12, dtype=np.float32).reshape(4, 3)
+    message = point_cloud(t.PointCloud("camera", xyz), xyz, 5)
+    layout = {
+        "names": [each.name for each in message.fields],
+        "formats": ["<f4"] * 3,
+        "offsets": [each.offset for each in message.fields],
+        "itemsize": message.point_stride,
+    }
+    read = np.frombuffer(message.data, np.dtype(layout))
+    assert [read[name].tolist() for name in "xyz"] == xyz.T.tolist()
+    assert (message.frame_id, message.pose.orientation.w) == ("camera", 1.0)
+
+
+@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 3)])
+def test_an_image_is_logged_without_loss_and_in_its_own_colours(shape: Any) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    message = compressed_image(t.Image(pixels, np.eye(3)), 5)
+    read = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (message.format, message.timestamp.ToNanoseconds()) == ("png", 5)
+    np.testing.assert_array_equal(read if read.ndim == 2 else read[..., ::-1], pixels)

@@ -13,11 +13,12 @@ import pytest
 from rich.console import Console
 
 from flangeye import types as t
+from flangeye.devices import RobotState
 from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder
-from flangeye.workflow.log.watch import follow, hidden_address, may_look, watch_run
+from flangeye.workflow.log.watch import RunView, follow, hidden_address, may_look, watch_run
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.runner import Runner
 from tests.conftest import TOY_RECIPE
@@ -139,6 +140,51 @@ def test_a_journal_and_a_solvers_progress_are_shown(log: Any) -> None:
     recorder.flangeye_run_finished({})
     rows = dict(watch_run(path, None, plain(), patience=5).rows())
     assert rows["error so far"] == "95 % below 0.400 mm after 7 poses, 0.350 mm required"
+
+
+def test_what_has_no_error_yet_is_not_observable(log: Any) -> None:
+    path, _ = log
+    recorder = Recorder(path, {}, False)
+    recorder.flangeye_noted("3.solve.robust", "progress", t.Progress(4, None, 0.35e-3))
+    recorder.flangeye_run_finished({})
+    rows = dict(watch_run(path, None, plain(), patience=5).rows())
+    assert rows["error so far"] == "not observable yet after 4 poses"
+
+
+@pytest.mark.parametrize(
+    ("silent", "told"),
+    [(4.9, ""), (5.1, ", nothing new for 5 s"), (61.0, ", nothing new for 61 s")],
+)
+def test_a_silence_of_five_seconds_is_said_until_the_run_has_ended(
+    monkeypatch: pytest.MonkeyPatch, silent: float, told: str
+) -> None:
+    view = RunView("2026_toy")
+    monkeypatch.setattr(time, "time", lambda: 1000.0 + silent)
+    assert view.rows()[0] == ("run", "2026_toy")  # nothing was heard of it yet
+    view.newest_ns = 1000 * 10**9
+    assert view.rows()[0] == ("run", f"2026_toy{told}")
+    view.ended = True
+    assert view.rows()[0] == ("run", "2026_toy, ended")
+
+
+def test_the_last_six_events_are_shown() -> None:
+    view = RunView("2026_toy")
+    for number in range(8):
+        view.note(f"event {number}")
+    assert view.events == [f"event {number}" for number in range(2, 8)]
+
+
+def test_an_arm_under_way_is_shown_in_millimetres_with_its_mode(log: Any) -> None:
+    path, _ = log
+    pose = np.eye(4)
+    pose[:3, 3] = [0.4, -0.12345, 1.0]
+    state = RobotState(t.Transform(t.BASE, t.FLANGE, pose), np.zeros(6), np.zeros(6), 1, "moving")
+    recorder = Recorder(path, {}, False)
+    recorder.flangeye_noted("0.acquire.live", "arm", state)
+    recorder.flangeye_run_finished({})
+    rows = dict(watch_run(path, None, plain(), patience=5).rows())
+    assert rows["arm"] == "400.0, -123.5, 1000.0 mm in the base, moving"
+    assert rows["captures"] == "0, 0 fitted"
 
 
 def test_the_next_pose_is_shown_with_what_it_promises(log: Any) -> None:
