@@ -128,8 +128,9 @@ def test_another_viewer_is_not_known(flangeye: Any) -> None:
 
 # --- what is drawn, by numbers --------------------------------------------------------------------
 
+NORMAL = np.array([0.0, 0.6, -0.8])
 CIRCLE = t.CircleFeature(
-    np.array([0.1, 0.2, 0.9]), np.array([0.0, 0.6, -0.8]), {"rim": 0.03, "bore": 0.016},
+    np.array([0.1, 0.2, 0.9]), NORMAL, {"rim": 0.03, "bore": 0.016},
     1e-8 * np.eye(3), 1e-8 * np.eye(3), 1.0,
 )  # fmt: skip
 SEAM = t.Seam(
@@ -162,15 +163,15 @@ def test_a_circle_is_drawn_as_a_ring_for_each_radius_and_three_centimetres_of_it
     assert circle_scene("7", CIRCLE, 5).entities[0].id == "circle/7"
     rim, bore, normal = drawn(circle_scene("7", CIRCLE, 5), "camera")
     for ring, radius in ((rim, 0.03), (bore, 0.016)):
-        require_ring(ring, CIRCLE.centre, CIRCLE.normal, radius, 73)
+        require_ring(ring, CIRCLE.centre, NORMAL, radius, 73)
     np.testing.assert_allclose(normal[0], CIRCLE.centre)
-    np.testing.assert_allclose(normal[1] - normal[0], 0.03 * CIRCLE.normal, atol=1e-12)
+    np.testing.assert_allclose(normal[1] - normal[0], 0.03 * NORMAL, atol=1e-12)
 
 
 def test_a_circle_s_points_are_dense_and_without_a_normal_its_centre_alone() -> None:
     points = points_of(circle_points(CIRCLE, 5))
-    require_ring(points[:361], CIRCLE.centre, CIRCLE.normal, 0.03, 361)
-    require_ring(points[361:722], CIRCLE.centre, CIRCLE.normal, 0.016, 361)
+    require_ring(points[:361], CIRCLE.centre, NORMAL, 0.03, 361)
+    require_ring(points[361:722], CIRCLE.centre, NORMAL, 0.016, 361)
     assert len(points) == 724
     bare = replace(CIRCLE, normal=None, normal_covariance=None)
     np.testing.assert_allclose(points_of(circle_points(bare, 5)), CIRCLE.centre[None], atol=1e-7)
@@ -192,13 +193,13 @@ def test_a_seam_is_drawn_with_rings_about_it_and_its_poses_lead_along_and_into_t
 def test_a_cloud_s_points_stand_in_its_frame_as_three_floats_each() -> None:
     xyz = np.arange(12, dtype=np.float32).reshape(4, 3)
     message = point_cloud(t.PointCloud("camera", xyz), xyz, 5)
-    layout = {
+    layout: Any = {
         "names": [each.name for each in message.fields],
         "formats": ["<f4"] * 3,
         "offsets": [each.offset for each in message.fields],
         "itemsize": message.point_stride,
     }
-    read = np.frombuffer(message.data, np.dtype(layout))
+    read: Any = np.frombuffer(message.data, np.dtype(layout))
     assert [read[name].tolist() for name in "xyz"] == xyz.T.tolist()
     assert (message.frame_id, message.pose.orientation.w) == ("camera", 1.0)
 
@@ -207,6 +208,6 @@ def test_a_cloud_s_points_stand_in_its_frame_as_three_floats_each() -> None:
 def test_an_image_is_logged_without_loss_and_in_its_own_colours(shape: Any) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     message = compressed_image(t.Image(pixels, np.eye(3)), 5)
-    read = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    read: Any = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
     assert (message.format, message.timestamp.ToNanoseconds()) == ("png", 5)
     np.testing.assert_array_equal(read if read.ndim == 2 else read[..., ::-1], pixels)
