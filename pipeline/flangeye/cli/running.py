@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -161,32 +162,51 @@ def _refuse(options: object, why: str) -> None:
 def _explain_refusal(
     log: Path, registry: Registry, result: Result, recipe: Recipe, called: str
 ) -> None:
-    """Print a refusal in three parts; the doctor looks for a calibration's mistake behind it."""
+    """Print a refusal in three parts: what is wrong, how it is known, and the next step."""
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
     from flangeye.files.elsewhere import with_urls
     from flangeye.workflow.doctor import mended_together
+    from flangeye.workflow.log.read import read_run
+    from flangeye.workflow.run.outlook import motions_to_add
 
     wrong = str(result.refused)
     after = _after_verification(recipe)
-    if wrong.split(":")[0] in after:
+    if (step := wrong.split(":")[0]) in after:
         again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {after[0]}"
-        known = "by what the step measured; the calibration before it was accepted"
+        known = f"{step} measured it; the calibration before it was accepted"
         print_refusal(Console(), wrong, known, [with_urls(again)])
         return
-    doctor = with_urls(f"flangeye doctor {log}")
-    if findings := _findings(log, registry, recipe):
+    findings, known = _findings(log, registry, recipe)
+    errors = with_urls(f"list each pose's error: flangeye show {quote(str(log.parent))} --outlook")
+    if findings:
         named, tried, steps = mended_together(findings)
-        print_refusal(Console(), named, tried or wrong, steps[:2] or [doctor])
+        print_refusal(Console(), named, tried or wrong, [*filter(None, steps[:2])] or [errors])
         return
-    known = "no mistake was recognised in poses or scans"
     failed = [step for step, found in result.verifications.items() if not found.passed]
     if failed:
-        known = f"{' and '.join(failed)} failed; {known}"
-    more = "add poses turned by 20 deg or more; the arm itself may be off"
-    held_out = any(step.endswith("verify.holdout") for step in failed)
-    print_refusal(Console(), wrong, known, [doctor, more] if held_out else [doctor])
+        known, advice = f"{' and '.join(failed)} failed; {known}", ""
+    else:
+        wrong, advice = _split_advice(wrong)
+    if any(step.endswith("verify.drift") for step in failed):
+        advice = "put the scanner back; or take verify.drift out of the recipe and use the new pose"
+    motions = [] if advice else motions_to_add(read_run(log), registry)
+    print_refusal(Console(), wrong, known, [next(filter(None, (advice, *motions, errors)))])
+
+
+def _split_advice(message: str) -> tuple[str, str]:
+    """Return what a solver refused, and its advice: the text after the first ``;``, or ``:``.
+
+    Brackets are skipped, since a line of a recipe in them contains colons.
+    """
+    flat = message
+    while (bare := re.sub(r"[({][^(){}]*[)}]", lambda m: "_" * len(m[0]), flat)) != flat:
+        flat = bare
+    for mark in ("; ", ": "):
+        if (at := flat.find(mark)) > 0:
+            return message[:at], message[at + 2 :]
+    return message, ""
 
 
 def _after_verification(recipe: Recipe) -> list[str]:
@@ -196,8 +216,11 @@ def _after_verification(recipe: Recipe) -> list[str]:
     return names[verified[-1] + 1 :] if verified else []
 
 
-def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding]:
-    """Return the mistakes that the doctor finds in a run, the one that explains most first."""
+def _findings(log: Path, registry: Registry, recipe: Recipe) -> tuple[Sequence[Finding], str]:
+    """Return the mistakes that the doctor finds in a run, and why there are none.
+
+    The mistake that explains most comes first.
+    """
     from flangeye.workflow.doctor.opening import examined
 
     try:
@@ -205,9 +228,10 @@ def _findings(log: Path, registry: Registry, recipe: Recipe) -> Sequence[Finding
             of_foreign(log, "it cannot be examined"),
             at_work("looking for the mistake", len(registry.of_kind("check"))) as checked,
         ):
-            return examined(log, registry, recipe, checked).findings
-    except FlangeyeError:
-        return ()  # the doctor needs more than this log has, and says so when it is asked
+            found = examined(log, registry, recipe, checked).findings
+    except FlangeyeError as error:  # the log has too little for the doctor
+        return (), str(error)
+    return found, "no mistake was recognised in poses or scans"
 
 
 def _recipe_of(
@@ -302,7 +326,8 @@ def _name_mistake(
 
     if (read := start.archive.path or recipe.archive) is None:
         return
-    if findings := _findings(folder.log, registry, recipe):
+    findings, _ = _findings(folder.log, registry, recipe)
+    if findings:
         print_refusal(Console(stderr=True), *mended_together(findings))
     else:
         doctor = f"flangeye doctor {quote(str(read))} --recipe {quote(called)}"

@@ -58,6 +58,13 @@ def outlook_of_log(log: RunLog, registry: Registry) -> Outlook:
     return outlook(recipe, registry, log.observations(), log.source or t.Source(fingerprint=""))
 
 
+def motions_to_add(log: RunLog, registry: Registry) -> list[str]:
+    """Return the motions that the poses of a log lack; empty if the workspace is covered."""
+    recipe = recipe_of_log(log, registry)
+    covered = _coverage(recipe, log.observations(), log.source or t.Source(fingerprint=""))
+    return covered.lacking() if covered else []
+
+
 def outlook(
     recipe: Recipe, registry: Registry, seen: Sequence[t.Observation], source: t.Source
 ) -> Outlook:
