@@ -147,7 +147,9 @@ def _changes(node: Any) -> Iterator[tuple[str, Callable[[Any], Any]]]:
         yield f"{ast.unparse(node)}: {other.__name__}", lambda n: setattr(n, "op", other())
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
         number: Any = node.value
-        more = number + 1 if isinstance(number, int) else number * 2 + 1e-3
+        # One nanosecond or one byte more is nothing that a test could see
+        counts = isinstance(number, int) and number < 1000
+        more = number + 1 if counts else number * 2 + (0 if isinstance(number, int) else 1e-3)
         yield f"{number} -> {more}", lambda n: setattr(n, "value", more)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
         yield f"{ast.unparse(node)}: without not", lambda n: setattr(n, "op", ast.UAdd())

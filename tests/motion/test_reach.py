@@ -335,6 +335,14 @@ def test_a_flat_body_turns_its_broad_side_to_the_camera_not_to_a_projector_aside
     assert np.abs(arm.shown) == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
 
 
+def test_a_body_is_worked_with_at_the_nearest_depth_at_which_it_can_be_shown() -> None:
+    camera = OVERHEAD.copy()
+    camera[2, 3] = 2.2  # the arm reaches up to 1.3 m below it
+    arm = Reach(MODEL, scanner(near=1.1, far=2.3), camera, TORCH)
+    assert arm.middle() == pytest.approx([0.6, 0.0, 0.9])
+    assert arm.why_refused() == ""  # what was tried on the way is no pose that was asked for
+
+
 def test_a_body_out_of_the_field_or_behind_the_arm_is_refused() -> None:
     wide = {"near": 0.1, "far": 9.0}
     for turn, field, shown in ((0.0, 60.0, True), (0.0, 2.0, False), (np.pi, 60.0, False)):
