@@ -237,3 +237,9 @@ def test_where_to_move_an_arm_is_suggested_after_the_first_scan(
         )
         arm.move_linear(arm.state().base_T_flange, 0.1, 0.5)
         assert "leaning 0 deg" in capsys.readouterr().err
+        for joints in np.random.default_rng(0).uniform(-3.0, 3.0, (20, 6)):
+            graph.joints = joints
+            cycles(arm, 1)
+            arm.move_joints(joints, 0.5, 1.0)
+            # Rounding may take the cosine of no angle at all beyond one
+            assert "leaning 0 deg" in capsys.readouterr().err
