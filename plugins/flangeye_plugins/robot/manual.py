@@ -333,10 +333,9 @@ def _readings(
         yield wrong_angle, (in_angle, numbers)
         both = f"{_unit(convention)}, and {wrong_angle}"
         yield both, (convention.in_units(length, angle), numbers)
-    for other in CONVENTIONS.values():
-        if other.rotation != convention.rotation and other.count == convention.count:
-            hint = f"are these numbers in the order and meaning of {other.name}"
-            yield hint, (other.in_units(convention.length, other.angle), numbers)
+    for other in CONVENTIONS.values():  # one that has more or fewer numbers refuses them
+        hint = f"are these numbers in the order and meaning of {other.name}"
+        yield hint, (other.in_units(convention.length, other.angle), numbers)
     backwards = np.concatenate([numbers[:3], numbers[:2:-1]])
     yield "are the angles in the opposite order", (convention, backwards)
 

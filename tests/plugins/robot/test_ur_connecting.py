@@ -105,6 +105,19 @@ def test_a_dashboard_that_hangs_up_is_one_line(dashboard: Any) -> None:
     )
 
 
+def test_a_dashboard_is_waited_for_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[Any] = []
+
+    def create_connection(address: Any, timeout: float) -> Any:
+        tried.append((address, timeout))
+        raise TimeoutError
+
+    monkeypatch.setattr(worker, "socket", SimpleNamespace(create_connection=create_connection))
+    with pytest.raises(TimeoutError), worker.ask_dashboard("10.0.0.1"):
+        pass
+    assert tried == [(("10.0.0.1", 29999), 1.0)]
+
+
 class Library:
     """A stand-in for rtde_control: it refuses a connection so often, and tells the time."""
 

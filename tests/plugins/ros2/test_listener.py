@@ -91,6 +91,21 @@ def test_an_arm_that_says_nothing_is_waited_for_a_second(graph: Moving) -> None:
     assert graph.looks == [0.5, 0.5]
 
 
+def test_an_arm_that_falls_silent_at_once_is_waited_for_a_second_too(
+    graph: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wait, began = graph.wait, graph.now
+
+    def first(topic: str, after: int, patience: float) -> GraphMessage | None:
+        graph.silent = graph.now > began
+        return wait(topic, after, patience)
+
+    monkeypatch.setattr(graph, "wait", first)
+    with refused("robot.ros2: /joint_states: nothing came on it"):
+        opened()
+    assert graph.now - began == pytest.approx(1.0, abs=0.003)
+
+
 def test_speeds_are_those_of_the_last_fifty_milliseconds(graph: Moving) -> None:
     with opened() as arm:
         cycles(arm, 100)
