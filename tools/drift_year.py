@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.estimation.watch.blame import blame, suspects
+from flangeye.estimation.watch.attribution import attribute_change, suspects
 from flangeye.estimation.watch.drift import (
     DriftTest,
     Information,
@@ -144,7 +144,9 @@ def _blamed(watched: Watched, first: int) -> str:
         told.summed(max(since - TEST.reference, 0), since)
     )
     last = len(told.matrix)
-    parts = blame(before, watched.sightings.of(since, last), ABOUT, watched.scanner, TEST.daily)
+    parts = attribute_change(
+        before, watched.sightings.of(since, last), ABOUT, watched.scanner, TEST.daily
+    )
     return suspects(parts)[0][0]
 
 

@@ -16,7 +16,7 @@ from flangeye.files.regular import write_whole
 from flangeye.models.finger import Calibration, Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
-from flangeye.motion.executor import Executor, led
+from flangeye.motion.executor import Executor, servo
 from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, Floats, Transform
@@ -150,7 +150,7 @@ class _Arm:
         """Open the arm to drive it, under guard."""
         if self._simulated:
             return nullcontext(self._simulated)
-        return led(self._driver, self._model, self._limits)
+        return servo(self._driver, self._model, self._limits)
 
 
 def _summary_lines(found: Calibration, measured: bool) -> list[str]:

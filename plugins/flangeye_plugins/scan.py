@@ -13,9 +13,9 @@ from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
 from flangeye.files.scans import natural
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
-from flangeye.motion.executor import Executor, led
+from flangeye.motion.executor import Executor, servo
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import Barred, Route, Router
+from flangeye.motion.route import NoRoute, Route, Router
 from flangeye.types import (
     BASE,
     CAMERA,
@@ -128,7 +128,7 @@ def scan_along(  # noqa: PLR0913  what it asks the runner for
         raise NothingMoved(
             f"{STAGE}: would scan from {len(_places(params))} places; nothing moved: add --move"
         )
-    with led(arm, robot, allowed) as opened, eye.open() as scanner:
+    with servo(arm, robot, allowed) as opened, eye.open() as scanner:
         drive = Executor(opened, robot, allowed)
         here = np.asarray(drive.tick().joints)
         clouds, stood = [], []
@@ -158,7 +158,7 @@ def routes_along(
     """
     model, found = Arm(robot), []
     for number, place in enumerate(_places(params), 1):
-        barred = Barred("out of the arm's reach")
+        barred = NoRoute("out of the arm's reach")
         for joints in _postures(model, _looking(place, params), flange_T_camera, here):
             way = Router(robot, limits, here).route(here, joints)
             if isinstance(way, Route):

@@ -201,7 +201,7 @@ def test_what_a_links_geometry_does_is_what_an_altered_arm_does(arm: Arm, link: 
     twists = arm.link_twists(joints, link).reshape(6, -1)
     for column, change in zip(twists.T, step * np.eye(3 * arm.n), strict=True):
         before, after = (
-            arm.altered(sign * change.reshape(-1, 3)).pose(joints, link) for sign in (-1, 1)
+            arm.perturbed(sign * change.reshape(-1, 3)).pose(joints, link) for sign in (-1, 1)
         )
         numeric = [rotation_log(after[:3, :3] @ before[:3, :3].T), after[:3, 3] - before[:3, 3]]
         assert column == pytest.approx(np.concatenate(numeric) / (2 * step), abs=1e-6)

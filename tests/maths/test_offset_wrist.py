@@ -54,7 +54,7 @@ def test_a_wrist_that_is_spherical_is_solved_too() -> None:
 def test_a_calibrated_arm_starts_from_the_nominal_one() -> None:
     nominal = Arm(load_model("robots", "fanuc-crx10ial"))
     off = np.random.default_rng(1).normal(0.0, 2e-4, (6, 3))
-    arm = nominal.altered(off)
+    arm = nominal.perturbed(off)
     for joints in postures(arm, 20, 10):
         found = arm.inverse(arm.flange(joints))
         assert np.abs(arm.flange(found) - arm.flange(joints)).max() < 2e-9

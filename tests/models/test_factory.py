@@ -58,7 +58,7 @@ def test_the_controllers_numbers_are_added_to_the_table(tmp_path: Path) -> None:
         ]
     )
     zeros = np.array([1e-3, -2e-3, 5e-4, 1e-3, -1e-3, 2e-3])
-    expected = Arm(UR5E).altered(deltas.T).flange(JOINTS + zeros)
+    expected = Arm(UR5E).perturbed(deltas.T).flange(JOINTS + zeros)
     assert Arm(found).flange(JOINTS) == pytest.approx(expected, abs=1e-12)
     assert "factory calibration from calibration.conf" in found.source
 

@@ -8,7 +8,7 @@ import numpy as np
 from flangeye.devices import RobotDriver
 from flangeye.models.arc import ArcTimes
 from flangeye.motion.arc import BURN, with_arc
-from flangeye.motion.executor import led
+from flangeye.motion.executor import servo
 from flangeye.plugin.stage import BoundPart
 from flangeye_plugins.arc import UrDigitalParams, arc_ur_digital
 from tests.motion.stand_in import LIMITS, MODEL
@@ -23,7 +23,7 @@ def main(host):
     driver = RobotDriver("robot.ur_rtde", partial(open_ur, host))
     params = UrDigitalParams(host=host, output=ARC, established=ARC)
     arc = BoundPart(arc_ur_digital, params)
-    with led(with_arc(driver, arc, ArcTimes()), MODEL, LIMITS) as arm:
+    with servo(with_arc(driver, arc, ArcTimes()), MODEL, LIMITS) as arm:
         print("leading", flush=True)
         began = arm.state().time_ns
         while True:

@@ -102,7 +102,7 @@ def test_a_fault_stops_the_arm_and_says_whose() -> None:
         )
     )
     drive, _ = under_watch(robot)
-    drive.lead()
+    drive.expect_velocities()
     with pytest.raises(DeviceError) as error:
         for _ in range(10):
             drive.tick()

@@ -531,7 +531,7 @@ def test_a_guard_has_precedence_over_who_leads_and_leaves_signals_to_the_alarm(
         with pytest.raises(SystemExit):  # as an exception, which stops the arm
             handlers[ending]()
     del asked[:]
-    with guard_module.precedence(guard_module.LEADING):
+    with guard_module.realtime_priority(guard_module.SERVO_PRIORITY):
         ((who, policy, how),) = asked
         assert (who, policy, how.sched_priority) == (0, os.SCHED_FIFO, 1)
     who, policy, how = asked[1]

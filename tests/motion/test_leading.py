@@ -9,7 +9,7 @@ import pytest
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import RunStopped
 from flangeye.motion.arm import WatchedArm
-from flangeye.motion.executor import ServoArm, led
+from flangeye.motion.executor import ServoArm, servo
 from flangeye.motion.route import Leg, Route
 from flangeye.motion.watchdog import GuardConfig, Report, Watchdog
 from flangeye.types import BASE, FLANGE, Transform
@@ -176,9 +176,9 @@ def test_a_fault_and_the_operator_s_stop_end_the_wait() -> None:
 
 def test_a_simulated_arm_and_one_moved_by_hand_are_opened_here() -> None:
     robot = StandIn()
-    with led(driver_of(robot), MODEL, LIMITS) as arm:
+    with servo(driver_of(robot), MODEL, LIMITS) as arm:
         assert arm is robot
     assert robot.closed
     driver = RobotDriver("robot.stand_in", lambda: robot, simulated=True)
-    with led(driver, MODEL, LIMITS) as arm:
+    with servo(driver, MODEL, LIMITS) as arm:
         assert arm is robot

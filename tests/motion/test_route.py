@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
 from flangeye.motion.clearance import ArmVolume
-from flangeye.motion.route import Barred, Route, Router
+from flangeye.motion.route import NoRoute, Route, Router
 from tests.motion.stand_in import LIMITS, MODEL, turned
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
@@ -23,7 +23,7 @@ ROUTER = Router(MODEL, LIMITS, HOME)
 def test_flange_and_joints_stay_below_their_speeds(turns: Any) -> None:
     goal = HOME + np.array(turns)
     way = ROUTER.route(HOME, goal)
-    if isinstance(way, Barred) or np.abs(goal - HOME).max() < 1e-3:
+    if isinstance(way, NoRoute) or np.abs(goal - HOME).max() < 1e-3:
         return
     (leg,) = way.legs
     assert leg.speed <= LIMITS.joint_speed + 1e-12
@@ -66,9 +66,9 @@ def test_a_way_is_checked_from_its_start_to_its_end_every_two_degrees() -> None:
     seen: list[Any] = []
 
     class Watching(Router):
-        def _bars(self, joints: Any, frames: Any, place: Any) -> str | None:
+        def _obstacle(self, joints: Any, frames: Any, place: Any) -> str | None:
             seen.append(joints)
-            return super()._bars(joints, frames, place)
+            return super()._obstacle(joints, frames, place)
 
     start = np.zeros(6)
     start[0] = -0.6
@@ -96,7 +96,7 @@ def test_an_arm_passes_a_millimetre_above_the_table_and_says_where_it_would_touc
         (near, *_) = Arm(MODEL).inverse_near(pose, joints[None])
         way = ROUTER.route(near, near)
         assert isinstance(way, Route) is clear
-    assert isinstance(way, Barred)
+    assert isinstance(way, NoRoute)
     place = ", ".join(f"{1e3 * x:.0f}" for x in pose[:3, 3])
     assert way.reason == f"touches the table with the flange at {place} mm"
 
@@ -104,14 +104,14 @@ def test_an_arm_passes_a_millimetre_above_the_table_and_says_where_it_would_touc
 def test_a_way_that_leads_through_the_table_is_barred() -> None:
     low = np.radians([0.0, 0.0, 30.0, -90.0, -90.0, 0.0])
     way = ROUTER.route(HOME, low)
-    assert isinstance(way, Barred)
+    assert isinstance(way, NoRoute)
     assert "table" in way.reason
 
 
 def test_a_way_out_of_the_box_is_barred_and_says_where() -> None:
     narrow = replace(LIMITS, high=np.array([-0.4, 1.0, 1.1]))
     way = Router(MODEL, narrow, HOME).route(HOME, turned(HOME, j1=np.pi))
-    assert isinstance(way, Barred)
+    assert isinstance(way, NoRoute)
     assert way.reason.startswith("outside the box: x is -")
     assert "allowed -1000 to -400 mm" in way.reason
 
@@ -120,7 +120,7 @@ def test_where_the_straight_way_is_barred_it_goes_by_home() -> None:
     arm, start, goal = Arm(MODEL), turned(HOME, j1=-1.2), turned(HOME, j1=1.2)
     furthest = np.abs(arm.flange(HOME)[0, 3])
     behind = replace(LIMITS, low=np.array([-furthest + 0.02, -1.0, -0.3]))
-    assert isinstance(Router(MODEL, behind, HOME).route(start, goal), Barred)
+    assert isinstance(Router(MODEL, behind, HOME).route(start, goal), NoRoute)
     folded = turned(HOME, j2=-0.3, j3=0.5)
     way = Router(MODEL, behind, folded).route(start, goal)
     assert isinstance(way, Route)

@@ -67,7 +67,7 @@ def test_who_else_moves_it_and_that_it_goes_on_is_said() -> None:
 
 def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
     watch = Supervisor(MODEL, LIMITS)
-    watch.led()
+    watch.expect_servo()
     fast = 1.3 * LIMITS.joint_speed
     state = moving(SECOND, 0.0)
     assert not watch.judge(replace(state, joint_speeds=np.r_[fast * 0.999, np.zeros(5)]))
@@ -77,7 +77,7 @@ def test_a_joint_may_be_a_little_faster_than_told_and_no_more() -> None:
 
 def test_the_bound_of_a_joint_s_speed_is_still_allowed() -> None:
     watch = Supervisor(MODEL, LIMITS)
-    watch.led()
+    watch.expect_servo()
     bound = 1.3 * LIMITS.joint_speed
     assert not watch.judge(replace(moving(SECOND, 0.0), joint_speeds=np.r_[bound, np.zeros(5)]))
 
@@ -99,7 +99,7 @@ def test_what_is_no_number_stops_an_arm_that_stands_or_moves(what: str, number: 
         watch = Supervisor(MODEL, LIMITS)
         assert not watch.judge(state)
         if led:
-            watch.led()
+            watch.expect_servo()
         with pytest.raises(
             SafetyFault, match="joint angles, speeds or forces that are not numbers"
         ):
@@ -264,7 +264,7 @@ def test_a_joint_may_be_a_twentieth_of_a_degree_beyond_its_limit() -> None:
     limits = replace(LIMITS, upper=AT_HOME.joints + 0.1)
     watch = Supervisor(MODEL, limits)
     watch.judge(AT_HOME)
-    watch.led()
+    watch.expect_servo()
     watch.judge(at(0.1, turned(AT_HOME.joints, j4=0.1 + 0.049 * DEGREE)))
     with pytest.raises(SafetyFault, match="joint 4 at"):
         watch.judge(at(0.2, turned(AT_HOME.joints, j4=0.1 + 0.051 * DEGREE)))
@@ -273,7 +273,7 @@ def test_a_joint_may_be_a_twentieth_of_a_degree_beyond_its_limit() -> None:
 def test_who_is_led_may_move_and_has_never_arrived() -> None:
     watch = Supervisor(MODEL, LIMITS)
     watch.judge(AT_HOME)
-    watch.led()
+    watch.expect_servo()
     assert not watch.judge(at(9.0, AT_HOME.joints, 0.3))
     watch.halted()
     with pytest.raises(SafetyFault, match="without a command from here"):

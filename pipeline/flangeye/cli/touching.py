@@ -12,7 +12,7 @@ from flangeye.errors import StageError
 from flangeye.files.regular import write_whole
 from flangeye.files.yaml_lines import dumped
 from flangeye.models.robots import RobotModel
-from flangeye.motion.touching import Touched, Toucher
+from flangeye.motion.touching import Toucher, TouchResult
 from flangeye.plugin.registry import Registry
 from flangeye.types import Floats, FrameMismatchError
 from flangeye.types.geometry import rpy_from_rotation
@@ -87,7 +87,7 @@ def _point(option: str, text: str) -> Floats:
         raise StageError(f"{option} '{text}': {error}; write '12 mm, -40 mm, 702 mm'") from None
 
 
-def _touched_line(number: int, touched: Touched) -> str:
+def _touched_line(number: int, touched: TouchResult) -> str:
     at = ", ".join(f"{1e3 * x:.2f}" for x in touched.actual)
     off = ", ".join(f"{1e3 * x:+.2f}" for x in touched.error)
     size = 1e3 * float(np.linalg.norm(touched.error))
@@ -96,7 +96,7 @@ def _touched_line(number: int, touched: Touched) -> str:
     )
 
 
-def _step(seen: Floats, tip: Floats, touched: Sequence[Touched]) -> str:
+def _step(seen: Floats, tip: Floats, touched: Sequence[TouchResult]) -> str:
     """Return the step ``verify.touch`` with the touched points, as a line of a recipe."""
     touches = [
         {

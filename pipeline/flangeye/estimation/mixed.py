@@ -150,7 +150,7 @@ class Fit:
         return np.asarray(whole)
 
 
-class Whitened(NamedTuple):
+class WhitenedModel(NamedTuple):
     """The whitened sightings at given variance components.
 
     Attributes:
@@ -166,14 +166,14 @@ class Whitened(NamedTuple):
     log_noise: float
 
 
-def whitened(model: LinearModel, sizes: Floats) -> Whitened:
+def whitened(model: LinearModel, sizes: Floats) -> WhitenedModel:
     """Return the whitened sightings at (S,) sizes of the noise."""
     roots = np.linalg.cholesky(model.noise(sizes))
     whitening = np.sqrt(model.shares)[:, None, None] * np.linalg.inv(roots)
     errors = (whitening @ model.residuals[..., None]).ravel()
     logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
     rows = stack_rows(whitening @ model.design)
-    return Whitened(whitening, rows, errors, float(2 * model.shares @ logs))
+    return WhitenedModel(whitening, rows, errors, float(2 * model.shares @ logs))
 
 
 def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
@@ -228,7 +228,7 @@ def marginal(model: LinearModel, sizes: Floats) -> Floats:
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
 
-def _with_slopes(model: LinearModel, found: Fit, known: Whitened, left: Floats) -> Fit:
+def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Floats) -> Fit:
     r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
     With V the covariance of the residuals, V_i its derivatives, and :math:`P = V^{-1} - V^{-1} G

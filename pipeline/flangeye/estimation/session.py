@@ -82,7 +82,7 @@ class Session:
         """Return the session with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
-    def again(self, observations: Sequence[Observation]) -> Session:
+    def refit(self, observations: Sequence[Observation]) -> Session:
         """Return the estimate from changed observations, started at the present one."""
         joints = {c.frame: c.joints for c in self.found.problem.carriers}
         problem = problem_of(observations, self.cell, self.asked.normals)
@@ -356,7 +356,7 @@ def _on_one_clock(session: Session) -> Session:
                 "was then is not in the recording: record more before and after each capture, or "
                 "let the arm stand still"
             )
-        moved = replace(moved.again(later), notes=session.notes)
+        moved = replace(moved.refit(later), notes=session.notes)
     sigmas = [float(np.sqrt(cov[0, 0])) for _, _, cov in moved.found.numbers("clock")]
     told = [
         f"{abs(x) * 1e3:.1f} +- {sigma * 1e3:.1f} ms {'after' if x > 0 else 'before'} the times "
@@ -376,7 +376,7 @@ def _with_size(session: Session, factor: float) -> Session:
         if max(map(abs, shares), default=0.0) < 1e-6:
             break
         factor *= 1 + shares[0]
-        session = session.again(_resized(session.observations, 1 + shares[0]))
+        session = session.refit(_resized(session.observations, 1 + shares[0]))
     known = float(np.sqrt(session.found.numbers("size")[0][2][0, 0]))
     # Taken for found when it is known to half the prior's deviation
     if known > 0.05:

@@ -92,7 +92,7 @@ def corrected_flange(
         if arm is None or correction.joints is None:
             raise ValueError("joint offsets need the arm's kinematics and a configuration")
         angles = _near(arm, base_T_flange, correction.joints) if joints is None else joints
-        built = arm if correction.lengths is None else arm.altered(np.asarray(correction.lengths))
+        built = arm if correction.lengths is None else arm.perturbed(np.asarray(correction.lengths))
         moved = built.flange(angles + correction.joint_offsets)
         # Apply only the change between the two models: the reported pose need not equal the model's
         pose = pose @ np.linalg.inv(arm.flange(angles)) @ moved

@@ -88,7 +88,7 @@ class SerialChain(Protocol):
         """Pose (4, 4) of the flange in the frame of the last link."""
 
 
-def altered(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any]:
+def perturbed(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any]:
     """Return a joint's parameters with (3,) added to ``a``, ``d`` [m] and ``alpha`` [rad].
 
     In a URDF the three are a shift of the joint's origin along x and z, and a roll.
@@ -100,7 +100,7 @@ def altered(joint: JointAxis, convention: str, lengths: Floats) -> dict[str, Any
     return {"a": joint.a + a, "d": joint.d + d, "alpha": joint.alpha + alpha}
 
 
-class Altered:
+class PerturbedJoint:
     """A joint whose parameters differ from the model's."""
 
     def __init__(self, joint: JointAxis, changes: dict[str, Any]) -> None:
@@ -153,11 +153,13 @@ class Arm:
         self._tool = robot.link_T_flange
         self._forms: dict[int, list[ClosedForm]] = {}
 
-    def altered(self, lengths: Floats) -> Arm:
+    def perturbed(self, lengths: Floats) -> Arm:
         """Return the arm with (n, 3) added to each joint's ``a``, ``d`` [m] and ``alpha`` [rad]."""
         robot = self._robot
         pairs = zip(robot.joints, lengths, strict=True)
-        joints = [Altered(joint, altered(joint, robot.convention, row)) for joint, row in pairs]
+        joints = [
+            PerturbedJoint(joint, perturbed(joint, robot.convention, row)) for joint, row in pairs
+        ]
         return Arm(Chain(joints, robot.convention, robot.link_T_flange))
 
     def frames(self, joints: Floats) -> Floats:
@@ -208,7 +210,7 @@ class Arm:
         """Return the flange's Jacobian by link parameters a, d, alpha: (..., n) -> (..., 6, n, 3).
 
         Its twist in ``base``, taken at its origin, for a unit of the joint's ``a``, ``d`` and
-        ``alpha`` (see :meth:`altered`); or that of a link, which the joints beyond do not move.
+        ``alpha`` (see :meth:`perturbed`); or that of a link, which the joints beyond do not move.
         """
         frames = self.frames(joints)
         moved = self.flange_of(frames) if link is None else frames[..., link, :, :]

@@ -203,7 +203,7 @@ def offset_wrist(directions: Floats, points: Floats, flange: Floats) -> OffsetWr
     Returns:
         None if the axes are not arranged as this method needs.
     """
-    searches = (_prepared(*axes, flange) for axes in as_meant(directions, points))
+    searches = (_prepared(*axes, flange) for axes in snapped_axes(directions, points))
     return next((search for search in searches if search is not None), None)
 
 
@@ -292,11 +292,11 @@ def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
         None where EAIK is not installed or knows no decomposition. The closed form raises
         :class:`DecompositionFailed` where EAIK fails at a pose.
     """
-    forms = (_decomposed(*axes, flange) for axes in as_meant(directions, points))
+    forms = (_decomposed(*axes, flange) for axes in snapped_axes(directions, points))
     return next((form for form in forms if form is not None), None)
 
 
-def as_meant(directions: Floats, points: Floats) -> Iterator[tuple[Floats, Floats]]:
+def snapped_axes(directions: Floats, points: Floats) -> Iterator[tuple[Floats, Floats]]:
     """Yield (6, 3) directions and points of the axes, then those of the nominal arm if one is near.
 
     A calibrated arm differs a little from one whose axes are parallel, meet or are in line.

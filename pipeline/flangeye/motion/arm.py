@@ -22,11 +22,11 @@ from flangeye.motion.route import Route
 from flangeye.motion.supervision import RememberedState
 from flangeye.motion.watchdog import (
     BEAT,
-    LEADING,
+    SERVO_PRIORITY,
     GuardConfig,
     Report,
     guard,
-    take_precedence,
+    take_realtime_priority,
     watchdog_process,
 )
 
@@ -91,7 +91,7 @@ class WatchedArm:
         self._told(self._state)
         return self._state
 
-    def lead(self, how: str, *motion: Any) -> None:
+    def servo(self, how: str, *motion: Any) -> None:
         """Send the next servo command: ``velocity`` or ``linear``, and its arguments."""
         self._say(how, motion)
         self._asked = how == "velocity"  # the guard answers it with the next cycle by itself
@@ -269,7 +269,7 @@ def _heartbeat() -> Iterator[None]:
 
 
 def _take_beats(over: threading.Event) -> None:
-    take_precedence(LEADING)
+    take_realtime_priority(SERVO_PRIORITY)
     over.wait()
 
 

@@ -24,8 +24,8 @@ from flangeye.types import Floats, Transform
 class Executor:
     """Moves an open arm while a guard supervises it.
 
-    A real arm is owned and watched by a guard in a process of its own (:func:`led`), which stops it
-    if this process hangs or dies. The same checks run in this process, in the control loop; in
+    A real arm is owned and watched by a guard in a process of its own (:func:`servo`), which stops
+    it if this process hangs or dies. The same checks run in this process, in the control loop; in
     simulated time these are the only ones.
 
     Attributes:
@@ -87,9 +87,9 @@ class Executor:
                 self.robot.wait_cycle()
         self._supervisor.halted()
 
-    def lead(self) -> None:
+    def expect_velocities(self) -> None:
         """Expect velocities from now on, and watch the limits alone."""
-        self._supervisor.led()
+        self._supervisor.expect_servo()
 
     def shift(self, base_T_flange: Transform, speed: float) -> RobotState:
         """Move the flange a short distance in a straight line; return when the arm is at rest.
@@ -97,7 +97,7 @@ class Executor:
         Raises:
             DeviceError: The arm was stopped by a safety fault, which the message names.
         """
-        self._supervisor.led()
+        self._supervisor.expect_servo()
         self.robot.move_linear(
             base_T_flange, min(speed, self.limits.speed), self.limits.acceleration
         )
@@ -130,7 +130,7 @@ def _moves(state: RobotState) -> bool:
 
 
 @contextmanager
-def led(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterator[Robot]:
+def servo(driver: RobotDriver, model: RobotModel, limits: MotionLimits) -> Iterator[Robot]:
     """Open an arm for servoing: under guard, or directly if it is simulated or moved by hand.
 
     Args:
@@ -178,11 +178,11 @@ class ServoArm(Device):
 
     def move_linear(self, base_T_flange: Transform, speed: float, acceleration: float) -> None:
         """Start a straight move of the flange [m/s, m/s^2]."""
-        self._arm.lead("linear", base_T_flange, speed, acceleration)
+        self._arm.servo("linear", base_T_flange, speed, acceleration)
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Move at a twist (6,); the guard stops the arm if the next command is late."""
-        self._arm.lead("velocity", twist, acceleration)
+        self._arm.servo("velocity", twist, acceleration)
 
     def wait_cycle(self) -> None:
         """Return at the start of the controller's next cycle."""

@@ -35,7 +35,7 @@ class Margins(NamedTuple):
     singularity: float
 
 
-class Refusal(NamedTuple):
+class RefusedPose(NamedTuple):
     """A pose of the flange that is impossible.
 
     Attributes:
@@ -90,7 +90,7 @@ class Reach:
         self._reach = robot.length
         self.home = np.zeros(self.arm.n)
         self._start: Floats | None = None
-        self.refusals: list[Refusal] = []
+        self.refusals: list[RefusedPose] = []
 
     def look_from(self, base_T_camera: Floats) -> None:
         """Set the scanner's pose (4, 4) ``base_T_camera``."""
@@ -193,7 +193,7 @@ class Reach:
         return nearest
 
     def _refuse(self, base_T_flange: Floats, reason: str) -> None:
-        self.refusals.append(Refusal(base_T_flange[:3, 3], reason))
+        self.refusals.append(RefusedPose(base_T_flange[:3, 3], reason))
 
     def in_view(self, base_T_flange: Floats) -> bool:
         """Return whether camera and projector see the whole disc, within the scanner's range."""

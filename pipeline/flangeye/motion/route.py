@@ -54,7 +54,7 @@ class Route(NamedTuple):
         return sum(leg.seconds for leg in self.legs)
 
 
-class Barred(NamedTuple):
+class NoRoute(NamedTuple):
     """There is no collision-free path; the message says what is in the way."""
 
     reason: str
@@ -68,7 +68,7 @@ class Router:
         self._arm, self._volume = Arm(robot), ArmVolume(robot)
         self._limits, self._home = limits, home
 
-    def route(self, start: Floats, goal: Floats) -> Route | Barred:
+    def route(self, start: Floats, goal: Floats) -> Route | NoRoute:
         """Return a path between joint angles (n,) and (n,)."""
         straight = self._leg(start, goal)
         if isinstance(straight, Leg):
@@ -78,20 +78,20 @@ class Router:
             return Route((first, second), "home")
         return straight
 
-    def _leg(self, start: Floats, goal: Floats) -> Leg | Barred:
+    def _leg(self, start: Floats, goal: Floats) -> Leg | NoRoute:
         # Both ends, and enough between that no joint turns by more than LARGEST_TURN unchecked
         count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
         frames = self._arm.frames(postures)
         places = self._arm.flange(postures)[:, :3, 3]
         for posture, frame, place in zip(postures, frames, places, strict=True):
-            if why := self._bars(posture, frame, place):
-                return Barred(why)
+            if why := self._obstacle(posture, frame, place):
+                return NoRoute(why)
         # Postures timed for each that is checked: between those the flange may be a percent faster
         finer = 8
         return self._timed(start, goal, finer * count)
 
-    def _bars(self, joints: Floats, frames: Floats, place: Floats) -> str | None:
+    def _obstacle(self, joints: Floats, frames: Floats, place: Floats) -> str | None:
         """Return the reason why a posture is forbidden; None if it is allowed."""
         axes = self._volume.axes(frames)
         if not self._volume.above(axes, TABLE):

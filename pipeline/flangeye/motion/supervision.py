@@ -48,27 +48,27 @@ class Supervisor:
         self.leg: Leg | None = None
         self._from = np.zeros(self._arm.n)
         self._since_ns = self._stood_ns = self._halted_ns = self._ready_ns = 0
-        self._led = False
+        self._servoed = False
 
     def set_off(self, leg: Leg) -> None:
         """Expect the arm to drive a leg from its present place."""
         newest = self.samples[-1]
-        self.leg, self._from, self._led = leg, newest.joints, False
+        self.leg, self._from, self._servoed = leg, newest.joints, False
         self._since_ns, self._stood_ns, self._ready_ns = newest.time_ns, 0, 0
 
     def halted(self) -> None:
         """Expect the arm to stop, wherever it comes to rest."""
-        self.leg, self._led = None, False
+        self.leg, self._servoed = None, False
         self._halted_ns = self.samples[-1].time_ns if self.samples else 0
 
-    def led(self) -> None:
+    def expect_servo(self) -> None:
         """Expect the arm to follow servo commands within its limits."""
-        self.leg, self._led = None, True
+        self.leg, self._servoed = None, True
 
     @property
     def under_way(self) -> bool:
         """Whether the arm is expected to move, and by us."""
-        return not self._by_hand and (self.leg is not None or self._led)
+        return not self._by_hand and (self.leg is not None or self._servoed)
 
     def judge(self, state: RobotState) -> bool:
         """Process a sample; return whether the present leg has ended and the arm has settled.
@@ -85,7 +85,7 @@ class Supervisor:
             )
         if self._by_hand:
             return self.leg is not None and state.mode == "ready"
-        if self.leg is None and not self._led:
+        if self.leg is None and not self._servoed:
             self._keep_still(state)
             return False
         self._keep_limits(state)

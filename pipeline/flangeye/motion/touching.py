@@ -14,7 +14,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.motion.arm import watched
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.reach import read_state
-from flangeye.motion.route import Barred, Route, Router
+from flangeye.motion.route import NoRoute, Route, Router
 from flangeye.types import Floats
 from flangeye.types.geometry import rigid
 
@@ -23,7 +23,7 @@ STOP_BEFORE = 0.005
 
 
 @dataclass(frozen=True, eq=False)
-class Touched:
+class TouchResult:
     """A point that was touched.
 
     Attributes:
@@ -60,7 +60,7 @@ class Toucher:
     tip: Floats
     ask: Callable[[str], None]
 
-    def touch(self, points: Floats, move: bool) -> Iterator[Touched]:
+    def touch(self, points: Floats, move: bool) -> Iterator[TouchResult]:
         """Drive the tip to points (N, 3) in ``base``; yield each contact.
 
         With ``move`` the arm goes to :data:`STOP_BEFORE` before each, in the orientation that it
@@ -76,7 +76,7 @@ class Toucher:
                 self._require_near(number, point)
             self.ask(f"point {number}: jog the tip onto it, slowly")
             flange = read_state(self.driver)[1].base_T_flange.matrix
-            yield Touched(point, self._tip_at(flange), flange)
+            yield TouchResult(point, self._tip_at(flange), flange)
 
     def _tip_at(self, flange: Floats) -> Floats:
         return np.asarray(flange[:3, :3] @ self.tip + flange[:3, 3])
@@ -115,8 +115,10 @@ class Toucher:
         for before in (above, STOP_BEFORE):
             pose = rigid(turn, point - before * along - turn @ self.tip)
             found = arm.inverse_near(pose, joints[None])
-            way = router.route(joints, found[0]) if len(found) else Barred("out of the arm's reach")
-            if isinstance(way, Barred):
+            way = (
+                router.route(joints, found[0]) if len(found) else NoRoute("out of the arm's reach")
+            )
+            if isinstance(way, NoRoute):
                 raise StageError(
                     f"touch: no way to {before * 1e3:g} mm before point {number}: {way.reason}; "
                     "jog the arm nearer, turn the tool, or go without --move"

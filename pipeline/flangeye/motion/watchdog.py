@@ -32,20 +32,20 @@ from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import Leg
 from flangeye.motion.supervision import RememberedState, SafetyFault, Supervisor
 
-LEADING = 1
+SERVO_PRIORITY = 1
 """Priority of the thread that servos the arm; that of its guard is higher."""
 
 
-def take_precedence(priority: int) -> None:
+def take_realtime_priority(priority: int) -> None:
     """Give the calling thread, and threads it starts, real-time priority."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 
 
 @contextlib.contextmanager
-def precedence(priority: int) -> Iterator[None]:
+def realtime_priority(priority: int) -> Iterator[None]:
     """Give the calling thread real-time priority while the context lasts."""
-    take_precedence(priority)
+    take_realtime_priority(priority)
     try:
         yield
     finally:
@@ -101,7 +101,7 @@ def watchdog_process(wire: Connection, charge: GuardConfig, alarm: Connection) -
     for ending in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(ending, lambda *_: sys.exit())  # as an exception, which stops the arm
     keyboard = _terminal(charge.keyboard)
-    take_precedence(LEADING + 1)
+    take_realtime_priority(SERVO_PRIORITY + 1)
     guard(wire, charge._replace(alarm=alarm.fileno(), keyboard=keyboard))
 
 
@@ -126,10 +126,10 @@ class Watchdog:
         self._supervisor = Supervisor(charge.model, charge.limits, isinstance(robot, MovedByHand))
         self._legs: list[Leg] = []
         self._told_ns = 0
-        self._barred: str | None = None
+        self._stopped_because: str | None = None
         self._wanted: tuple[int, int] | None = None
         self._asked, self._listens = False, 0.0
-        self._led_ns: int | None = None
+        self._servo_ns: int | None = None
         self._paused = False
         self._turned = self._heard = time.monotonic()
 
@@ -137,7 +137,7 @@ class Watchdog:
         """Watch the arm, cycle by cycle, until the program closes the wire."""
         self._open()
         while self._obey():
-            self._keep_led()
+            self._check_servo()
             self._cycle()
             self._tell_samples()
 
@@ -148,7 +148,7 @@ class Watchdog:
             self._supervisor.check_model(state)
             self._wire.send(Report("opened", (self._robot.name, self._robot.period, state)))
         except (SafetyFault, DeviceError) as fault:
-            self._bar(str(fault))
+            self._stop_for_good(str(fault))
 
     def _cycle(self) -> None:
         """Watch the arm for one of its cycles."""
@@ -169,7 +169,7 @@ class Watchdog:
                 self._told_ns = state.time_ns
                 self._wire.send(Report("state", state))
         except (SafetyFault, DeviceError) as fault:
-            self._bar(str(fault))
+            self._stop_for_good(str(fault))
 
     def _require_life(self) -> None:
         """Raise SafetyFault if the program was silent, or this process was suspended.
@@ -202,19 +202,21 @@ class Watchdog:
             self._asked, self._listens = False, listening * self._robot.period
             self._wire.send(Report("cycle", state))
 
-    def _keep_led(self) -> None:
+    def _check_servo(self) -> None:
         """Stop an arm if the program that servos it sends no commands any more."""
-        if self._led_ns is None:
+        if self._servo_ns is None:
             return
-        silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._led_ns)
+        silent = 1e-9 * (self._supervisor.samples[-1].time_ns - self._servo_ns)
         if silent > AT_REST:
-            self._bar(f"the program that moves the arm sent no command for {AT_REST:.0f} s")
+            self._stop_for_good(
+                f"the program that moves the arm sent no command for {AT_REST:.0f} s"
+            )
         elif silent > 2.0 * GRACE and not self._paused:
             self._paused = True  # the driver brakes by itself, and before: not on that alone
             try:
                 self._robot.stop()
             except DeviceError as lost:
-                self._bar(str(lost))
+                self._stop_for_good(str(lost))
 
     def _next_leg(self, state: RobotState) -> None:
         self._legs.pop(0)
@@ -230,20 +232,20 @@ class Watchdog:
         self._robot.move_joints(leg.joints, leg.speed, leg.acceleration)
 
     def _halt(self) -> None:
-        self._legs, self._led_ns = [], None
+        self._legs, self._servo_ns = [], None
         self._supervisor.halted()
         self._robot.stop()
 
-    def _bar(self, reason: str) -> None:
+    def _stop_for_good(self, reason: str) -> None:
         """Stop the arm permanently: after a safety fault this guard starts no further motion."""
-        self._legs, self._led_ns = [], None
+        self._legs, self._servo_ns = [], None
         self._supervisor.halted()
         try:
             self._robot.stop()
         except DeviceError as lost:
             reason = reason if reason == str(lost) else f"{reason}; stopping it: {lost}"
-        if self._barred is None:
-            self._barred = reason
+        if self._stopped_because is None:
+            self._stopped_because = reason
             self._wire.send(Report("fault", reason))
 
     def _operator(self) -> str | None:
@@ -269,7 +271,7 @@ class Watchdog:
                 self._halt_if_possible()
             elif request == "samples":
                 self._wanted = content
-            elif self._barred is None and request != "cycle":
+            elif self._stopped_because is None and request != "cycle":
                 self._command(request, content)
             if request in ("cycle", "velocity"):
                 # A servoing program sends one command a cycle: waiting for more would be in vain
@@ -283,18 +285,18 @@ class Watchdog:
         try:
             self._require_since("guard", self._turned)  # nothing asked before a pause is done
             if request == "go":
-                self._legs, self._led_ns = list(content.legs), None
+                self._legs, self._servo_ns = list(content.legs), None
                 self._set_off()
             elif request == "velocity":
-                self._supervisor.led()
-                self._led_ns, self._paused = self._supervisor.samples[-1].time_ns, False
+                self._supervisor.expect_servo()
+                self._servo_ns, self._paused = self._supervisor.samples[-1].time_ns, False
                 self._robot.move_velocity(*content)
             elif request == "linear":
-                self._supervisor.led()
-                self._led_ns = None
+                self._supervisor.expect_servo()
+                self._servo_ns = None
                 self._robot.move_linear(*content)
         except (SafetyFault, DeviceError) as fault:
-            self._bar(str(fault))
+            self._stop_for_good(str(fault))
         self._turned = time.monotonic()  # a command may wait until the arm rests
 
     def _tell_samples(self) -> None:
@@ -304,7 +306,7 @@ class Watchdog:
         start_ns, end_ns = self._wanted
         samples = self._supervisor.samples
         over = bool(samples) and samples[-1].time_ns >= end_ns
-        if over or self._barred is not None:
+        if over or self._stopped_because is not None:
             self._wire.send(Report("samples", _during(samples, start_ns, end_ns)))
             self._wanted = None
 
@@ -312,7 +314,7 @@ class Watchdog:
         try:
             self._halt()
         except DeviceError as lost:
-            self._bar(str(lost))
+            self._stop_for_good(str(lost))
 
 
 def _during(samples: Any, start_ns: int, end_ns: int) -> list[RememberedState]:

@@ -60,7 +60,7 @@ def _end_with_input(ended: asyncio.Event) -> None:
         ended.set()
 
 
-def _take_precedence() -> None:
+def _take_realtime_priority() -> None:
     """Raise the process's priority and tune the garbage collector, for punctual cycles.
 
     A real controller has its own processor; this one takes a quarter of a core. Raising the
@@ -122,7 +122,7 @@ class Server:
             self._add_fault(text)
         await self._network.listen()
         await self._behind.listen()
-        _take_precedence()
+        _take_realtime_priority()
         self._clock.start()
         self._say(self._greeting())
         await ended.wait()

@@ -304,7 +304,7 @@ class ArmResponse:
 Item = TypeVar("Item")
 
 
-class Stamped(NamedTuple, Generic[Item]):
+class TimestampedExposure(NamedTuple, Generic[Item]):
     """An exposure with its reported timestamp [s]."""
 
     stamp: float
@@ -316,7 +316,7 @@ class Shutter(Generic[Item]):
 
     def __init__(self, truth: ClockTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
-        self._under_way: deque[tuple[float, Stamped[Item]]] = deque()
+        self._under_way: deque[tuple[float, TimestampedExposure[Item]]] = deque()
         self._count = 0
 
     def due(self, age: float) -> bool:
@@ -332,14 +332,14 @@ class Shutter(Generic[Item]):
         late = max(0.0, truth.latency + truth.jitter * float(self._rng.standard_normal()))
         if self._rng.uniform() < truth.dropped:
             return
-        self._under_way.append((time + late, Stamped(time + truth.stamp, item)))
+        self._under_way.append((time + late, TimestampedExposure(time + truth.stamp, item)))
 
     def hidden(self, age: float) -> bool:
         """Return whether the tag is covered at this age of the camera [s]."""
         hidden = self._truth.hidden
         return hidden is not None and hidden[0] <= age < hidden[1]
 
-    def arrived(self, time: float) -> Stamped[Item] | None:
+    def arrived(self, time: float) -> TimestampedExposure[Item] | None:
         """Return the next image that has arrived by ``time`` [s]; None without one."""
         if not self._under_way or self._under_way[0][0] > time:
             return None

@@ -15,8 +15,8 @@ from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel
 from flangeye.models.targets import Flange
-from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, Refusal, Site, poses_near
-from flangeye.motion.route import Barred, Route, Router
+from flangeye.motion.reach import Margins, Plan, PlannedPose, Reach, RefusedPose, Site, poses_near
+from flangeye.motion.route import NoRoute, Route, Router
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Floats, Observation, PoseFeature, Role
 from flangeye.types.geometry import angle_between, invert, kabsch, rigid
@@ -104,7 +104,7 @@ class Itinerary:
         if base_T_camera is not None:
             self._reach.look_from(base_T_camera)
 
-    def way(self, start: Floats, stop: Stop) -> Route | Barred:
+    def way(self, start: Floats, stop: Stop) -> Route | NoRoute:
         """Return the path from joint angles (n,) to a stop, or the obstacle."""
         return self._router.route(start, stop.pose.joints)
 
@@ -127,7 +127,7 @@ class Itinerary:
         for stop in stops:
             way = None if here is None else self.way(here, stop)
             rows.append(self._row(stop, way))
-            if not isinstance(way, Barred):
+            if not isinstance(way, NoRoute):
                 here = stop.pose.joints
         head = (
             f"{len(stops)} stops, {seconds_of(rows):.0f} s of motion; {self._plan.wanted} were "
@@ -149,9 +149,9 @@ class Itinerary:
                 "centre, or widen robot.limits"
             )
 
-    def _row(self, stop: Stop, way: Route | Barred | None) -> PlanRow:
+    def _row(self, stop: Stop, way: Route | NoRoute | None) -> PlanRow:
         row = row_at(stop.id, stop.role, stop.pose, self._site.eye)
-        if isinstance(way, Barred):
+        if isinstance(way, NoRoute):
             return replace(row, why_not=way.reason)
         if way is None:
             return row
@@ -289,7 +289,7 @@ def row_at(id_: str, role: str, pose: PlannedPose, eye: Floats) -> PlanRow:
     return PlanRow(id_, role, list(_place(place)), float(angle_between(normal, eye - place)))
 
 
-def left_out(refusals: Iterable[Refusal], poses: Iterable[PlannedPose]) -> list[PlanRow]:
+def left_out(refusals: Iterable[RefusedPose], poses: Iterable[PlannedPose]) -> list[PlanRow]:
     """Return a row for each place without a possible pose, a few of every reason first."""
     reasons = defaultdict[tuple[float, ...], Counter[str]](Counter)
     for refusal in refusals:

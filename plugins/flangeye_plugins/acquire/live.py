@@ -35,7 +35,7 @@ from flangeye.models.targets import Flange
 from flangeye.motion.arm import WatchedArm, watched
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.reach import Margins, read_state
-from flangeye.motion.route import Barred, Leg, Route
+from flangeye.motion.route import Leg, NoRoute, Route
 from flangeye.motion.supervision import RememberedState
 from flangeye.plugin.stage import BoundPart, Choose, Params, stage
 from flangeye.types import (
@@ -276,7 +276,7 @@ class LiveSession:
             if stop.id in self.done:
                 continue
             way = self._way(stop)
-            if isinstance(way, Barred):
+            if isinstance(way, NoRoute):
                 yield _rejected(stop, f"no way there: {way.reason}")
                 continue
             self.stage_log("next", {"id": stop.id, "why": stop.pose.why})
@@ -288,7 +288,7 @@ class LiveSession:
         if taken:
             yield taken()
 
-    def _way(self, stop: Stop) -> Route | Barred:
+    def _way(self, stop: Stop) -> Route | NoRoute:
         if self.passive:
             return Route((Leg(stop.pose.joints, 1.0, 1.0, 0.0),))
         return self.itinerary.way(self.arm.state.joints, stop)

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 
 from flangeye import StageError, stage
-from flangeye.maths.kinematics import altered
+from flangeye.maths.kinematics import perturbed
 from flangeye.models.robots import RobotModel
 from flangeye.types import ArmCorrection, CalibratedPose, ExportedFile, HandEye
 from flangeye.types.pose_formats import CONVENTIONS, PoseConvention
@@ -223,7 +223,7 @@ def with_correction(robot: RobotModel, correction: ArmCorrection) -> RobotModel:
     joints = [
         joint.model_copy(
             update={
-                **altered(joint, robot.convention, np.asarray(row)),
+                **perturbed(joint, robot.convention, np.asarray(row)),
                 "theta": joint.theta + float(zero),
             }
         )

@@ -129,7 +129,7 @@ def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | N
     )
 
 
-def soonest(ends: list[End], limit: float) -> tuple[float, float]:
+def earliest_end(ends: list[End], limit: float) -> tuple[float, float]:
     """Return a seam's end, the first of its surfaces' ends, and its standard deviation [m].
 
     Surfaces that reach ``limit`` do not end; if none ends, the deviation is infinite. Ends that

@@ -17,9 +17,9 @@ from flangeye.types import Box, Floats, Seam, VerifiedHandEye, WorkpieceScan
 from flangeye.units import Length, param
 from flangeye_plugins.seam.ends import (
     Rays,
+    earliest_end,
     face_ends,
     last_in_lanes,
-    soonest,
     surface_end,
     surfaces,
 )
@@ -86,7 +86,7 @@ class Found:
         s = self.local[:, 0]
         return self.local[(s > self.ends[0]) & (s < self.ends[1])]
 
-    def again(self, points: Floats, reach: float) -> Found:
+    def along_fit(self, points: Floats, reach: float) -> Found:
         """Return the joint with points in local coordinates of frames along the fitted line."""
         line = self.course.moved(*self.swept.spline.at(self.course.s).T)
         flat = Spline.through(line.length, line.closed, line.s, np.zeros((len(line.s), 3)))
@@ -201,7 +201,7 @@ def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> Found:
     # The second and third time along the line that the first has found
     refits = 3
     for k in range(refits):
-        found = found.again(points, box) if k else found
+        found = found.along_fit(points, box) if k else found
         edges = face_ends(found.swept, found.inside, pitch, params.max_residual)
         swept = fitted(found.swept, found.local, pitch, params.max_residual, edges)
         found = _with_ends(replace(found, swept=swept))
@@ -283,7 +283,7 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
         ends += [] if end is None else [end]
     limit = found.course.length if sign > 0 else 0.0
     # Two pixels short of the course's end the scan was cut, not the plate.
-    place, deviation = soonest(ends, sign * limit - 2 * pitch)
+    place, deviation = earliest_end(ends, sign * limit - 2 * pitch)
     if np.isinf(deviation):
         return limit, deviation
     # Of a pixel, for those that scanners drop or invent beside a jump of depth: the simulated

@@ -140,7 +140,7 @@ def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: f
     The arm is commanded to stop in every case, also on an exception, and the log is complete.
     """
     began: float | None = None
-    cell.drive.lead()
+    cell.drive.expect_velocities()
     try:
         clock = WeldClock()
         while controller.phase not in ("done", "stopped"):
@@ -207,7 +207,7 @@ class WeldClock:
 
 
 @contextmanager
-def undisturbed() -> Iterator[None]:
+def low_latency() -> Iterator[None]:
     """Return a context without garbage collection and with short thread-switch intervals.
 
     A garbage collection takes tens of milliseconds, so it runs before and after the weld only. Each

@@ -241,7 +241,7 @@ class MultiPassController:
         dead, elapsed = self._response.dead_time, now - (self._began or now)
         # What the arm carries out now was commanded one dead time ago.
         self.aim = self._pass.across + self._weave.at(elapsed - dead).aside
-        return self._weave.at(elapsed).led(self._response.lag)
+        return self._weave.at(elapsed).for_lag(self._response.lag)
 
     def _bend(self) -> float:
         """Return the path's curvature at the torch [1/m], to the left positive."""

@@ -14,7 +14,7 @@ from flangeye.models.finger import Finger
 from flangeye.models.robots import RobotModel
 from flangeye.motion.clearance import ArmVolume
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import LARGEST_TURN, TABLE, Barred, Route, Router
+from flangeye.motion.route import LARGEST_TURN, TABLE, NoRoute, Route, Router
 from flangeye.types import Floats, Transform
 from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool
@@ -107,18 +107,18 @@ class SeamReach:
             "bring the arm above the work by hand"
         )
 
-    def _way(self, here: Floats, high: Floats, low: Floats) -> Route | Barred:
+    def _way(self, here: Floats, high: Floats, low: Floats) -> Route | NoRoute:
         task = self._task
         slow = min(task.params.approach_joint_speed, task.limits.joint_speed)
         speed = min(task.params.approach_speed, task.limits.speed)
         limits = replace(task.limits, speed=speed, joint_speed=slow)
         router = Router(task.model, limits, here)
         over, down = router.route(here, high), router.route(high, low)
-        if isinstance(over, Barred) or isinstance(down, Barred):
-            return over if isinstance(over, Barred) else down
+        if isinstance(over, NoRoute) or isinstance(down, NoRoute):
+            return over if isinstance(over, NoRoute) else down
         return self._touches(here, high) or Route((*over.legs, *down.legs))
 
-    def _touches(self, start: Floats, goal: Floats) -> Barred | None:
+    def _touches(self, start: Floats, goal: Floats) -> NoRoute | None:
         """Return the obstacle if finger or torch would come too near to the work; else None."""
         count = 2 + int(np.abs(goal - start).max() / LARGEST_TURN)
         postures = start + np.linspace(0.0, 1.0, count)[:, None] * (goal - start)
@@ -128,7 +128,7 @@ class SeamReach:
         lowest = min(task.tool.lowest(matrix) for matrix in self._arm.flange(postures))
         if lowest >= allowed:
             return None
-        return Barred(
+        return NoRoute(
             f"finger or torch would come to {lowest * 1e3:.0f} mm above the work, "
             f"{allowed * 1e3:.0f} mm are asked for"
         )
@@ -153,7 +153,7 @@ class SeamReach:
                 joints = _nearest(chain[-1], postures[i])
                 low, high = np.minimum(low, joints), np.maximum(high, joints)
                 turns = self._whole_turns(low, high)
-                bar = self._bars(chain[-1] + turns, joints + turns)
+                bar = self._obstacle(chain[-1] + turns, joints + turns)
                 if bar is None and (why := self._beyond(low + turns, high + turns)):
                     bar = Barrier(2, why)
                 if bar is not None:
@@ -192,7 +192,7 @@ class SeamReach:
         allowed = ((chain + turns >= low) & (chain + turns <= high)).all(axis=0)
         return np.asarray(chain + np.where(allowed, turns, 0.0))
 
-    def _bars(self, before: Floats, joints: Floats) -> Barrier | None:
+    def _obstacle(self, before: Floats, joints: Floats) -> Barrier | None:
         """Return the reason why a posture cannot follow another one; None if it can."""
         # The order matters: the message is that of the attempt that passes most checks
         axes = self._volume.axes(self._arm.frames(joints))

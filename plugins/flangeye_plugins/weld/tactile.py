@@ -13,16 +13,16 @@ from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.models.robots import RobotModel
 from flangeye.motion.arc import with_arc
-from flangeye.motion.executor import Executor, led
+from flangeye.motion.executor import Executor, servo
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.watchdog import LEADING, precedence
+from flangeye.motion.watchdog import SERVO_PRIORITY, realtime_priority
 from flangeye.plugin.stage import stage
 from flangeye.types import Note, Seam, Seed, StageLog, VerifiedHandEye, Warn, WeldReport
 from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_plugins.weld import checks
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.corners import leg_of
-from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, undisturbed
+from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, low_latency
 from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
 from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
@@ -70,7 +70,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     if not (motion.allowed or driver.simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
-        robot: Robot = opened.enter_context(led(driver, model, allowed))
+        robot: Robot = opened.enter_context(servo(driver, model, allowed))
         job = CameraJob(params.sensor, planned.finger, robot.state(), seed, params.look)
         reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
         eyes = opened.enter_context(reader)
@@ -85,8 +85,8 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         )  # fmt: skip
         approach(cell, passage, weld_log, params.mode)
         if not driver.simulated:
-            opened.enter_context(precedence(LEADING))
-            opened.enter_context(undisturbed())
+            opened.enter_context(realtime_priority(SERVO_PRIORITY))
+            opened.enter_context(low_latency())
         reason = follow(
             cell, controller, weld_log, _longest(plan.length + planned.body.distance, params)
         )
@@ -99,7 +99,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
+class PlannedWeld:
     """A planned weld, before anything moves.
 
     Attributes:
@@ -133,7 +133,7 @@ class Planned:
 
 def _planned(
     seam: Seam, driver: RobotDriver, allowed: MotionLimits, params: WeldTactileParams
-) -> Planned:
+) -> PlannedWeld:
     """Return the planned weld after all checks that need no motion.
 
     Raises:
@@ -157,13 +157,13 @@ def _planned(
         prior = replace(prior, arc=(times.gas_before, times.ignition, times.crater))
     checks.check_tool(body, prior, params)
     check_bound(plan, prior, params)
-    return Planned(
+    return PlannedWeld(
         seam, surface, plan, finger, body, Tool(finger, surface, body), prior, params, start,
         driver, None if times is None else times.gas_after, kept,
     )  # fmt: skip
 
 
-def _kept(planned: Planned, follower: Follower | None) -> tuple[Note, ...]:
+def _kept(planned: PlannedWeld, follower: Follower | None) -> tuple[Note, ...]:
     """Write a weld's estimates to the ``prior`` file; return a note about it."""
     path = planned.params.prior
     if path is None or follower is None:
@@ -203,7 +203,7 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
     )
 
 
-def start_of(planned: Planned, prior: ModelPrior) -> dict[str, Any]:
+def start_of(planned: PlannedWeld, prior: ModelPrior) -> dict[str, Any]:
     """Return all inputs of the controller other than measurements, for the log."""
     params, kept = planned.params, planned.kept
     return {

@@ -265,7 +265,7 @@ def test_the_control_channel_stays_on_this_machine(
         os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(Network, "listen", listen)
-    monkeypatch.setattr(server, "_take_precedence", lambda: None)
+    monkeypatch.setattr(server, "_take_realtime_priority", lambda: None)
     serve(EmulatorOptions(robot=load_model("robots", "ur5e"), host=host))
     assert opened == [host, "127.0.0.1" if host == "0.0.0.0" else host]
     assert where in capsys.readouterr().out

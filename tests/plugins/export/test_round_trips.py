@@ -541,7 +541,7 @@ def test_an_arm_with_other_zeros_stands_as_it_reports_less_these(lengths: bool) 
     longer: Any = 1e-3 * np.arange(18.0).reshape(6, 3) if lengths else None
     correction = ArmCorrection(np.zeros(3), joint_offsets=zeros, lengths=longer)
     corrected, joints = Arm(with_correction(robot, correction)), np.array([0.1, -1, 1, -1, -1, 0.3])
-    arm = Arm(robot) if longer is None else Arm(robot).altered(longer)
+    arm = Arm(robot) if longer is None else Arm(robot).perturbed(longer)
     np.testing.assert_allclose(corrected.flange(joints), arm.flange(joints + zeros), atol=1e-12)
 
 

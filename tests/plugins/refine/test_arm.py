@@ -204,7 +204,7 @@ def test_the_corrected_arm_is_a_robot_file() -> None:
     assert file.name == "my_ur5.yaml"
     read = RobotModel.model_validate(parse_yaml(file.text, "my_ur5.yaml").data)
     correction, arm = found.corrected.correction, Arm(UR5)
-    expected = arm.altered(correction.lengths).flange(HOME + correction.joint_offsets)
+    expected = arm.perturbed(correction.lengths).flange(HOME + correction.joint_offsets)
     assert Arm(read).flange(HOME) == pytest.approx(expected, abs=1e-9)
     with pytest.raises(StageError, match="no error of the arm's joints was found; add refine.arm"):
         export_robot(pose, found.as_reported(), UR5, NamedParams())

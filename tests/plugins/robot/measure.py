@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from flangeye_plugins.robot.ur.worker import take_precedence
+from flangeye_plugins.robot.ur.worker import take_realtime_priority
 from tests.emulators.controllers.process import Process
 from tests.plugins.robot.cell import open_ur
 
@@ -29,7 +29,7 @@ def main():
         opening = time.perf_counter()
         with open_ur(process.host) as robot:
             opening = time.perf_counter() - opening
-            take_precedence()
+            take_realtime_priority()
             commands, reads = [], []
             for _ in range(CYCLES):
                 commands.append(seconds(lambda: robot.move_velocity(UPWARDS, 0.5)))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from flangeye.motion.watchdog import LEADING, precedence
+from flangeye.motion.watchdog import SERVO_PRIORITY, realtime_priority
 from tests.plugins.ros2 import installed
 
 
@@ -14,5 +14,5 @@ def env(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
     given = installed.environment(installed.free_domain())
     for name, value in given.items():
         monkeypatch.setenv(name, value)
-    with precedence(LEADING):  # as the guard of an arm
+    with realtime_priority(SERVO_PRIORITY):  # as the guard of an arm
         yield given

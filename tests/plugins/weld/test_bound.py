@@ -11,7 +11,7 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye_emulators.weld_world.truth import WeldTruth
-from flangeye_plugins.weld.following.bound import Predicted, beforehand, check_bound, predicted
+from flangeye_plugins.weld.following.bound import Predicted, best_sweep_fit, check_bound, predicted
 from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.probing import SOFTER
 from flangeye_plugins.weld.path import Path
@@ -28,7 +28,7 @@ def following(**given: Any) -> Following:
 
 
 def foreseen(plan: Path, prior: ModelPrior, settings: Following) -> Predicted:
-    return predicted(plan, prior, settings, *beforehand(prior, settings))
+    return predicted(plan, prior, settings, *best_sweep_fit(prior, settings))
 
 
 def arc() -> Path:

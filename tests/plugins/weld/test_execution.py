@@ -10,7 +10,7 @@ import pytest
 
 from flangeye.devices import DeviceError, WeldProfile
 from flangeye.motion.seam_following import Command, Controller, ToolPose
-from flangeye_plugins.weld.execution import WeldClock, follow, undisturbed
+from flangeye_plugins.weld.execution import WeldClock, follow, low_latency
 from flangeye_plugins.weld.tactile import _longest
 from flangeye_plugins.weld.weld_log import WeldLog
 
@@ -45,13 +45,13 @@ def test_a_clock_counts_what_a_cycle_computes_and_nothing_else() -> None:
 
 def test_garbage_is_not_collected_in_the_loop_and_is_again_after_it() -> None:
     assert gc.isenabled()
-    with pytest.raises(KeyboardInterrupt), undisturbed():
+    with pytest.raises(KeyboardInterrupt), low_latency():
         assert not gc.isenabled()
         raise KeyboardInterrupt
     assert gc.isenabled()
     gc.disable()
     try:
-        with undisturbed():
+        with low_latency():
             pass
         assert not gc.isenabled()
     finally:
@@ -71,8 +71,8 @@ class Desk:
         self.limits, self.steered = SimpleNamespace(acceleration=0.7), None
         self.gas_after = None
 
-    def lead(self) -> None:
-        self.told.append("lead")
+    def expect_velocities(self) -> None:
+        self.told.append("expect_velocities")
 
     def stop(self) -> None:
         self.told.append("stop")
@@ -137,7 +137,11 @@ def test_a_cycle_reads_decides_commands_and_is_logged() -> None:
     assert reason == "enough"
     command = (("twist", 0.3, "here"), 0.7)
     felt = [("checked", 0.11, 1), ("checked", 0.11, 0), ("checked", 0.11, 1)]
-    assert desk.told == ["lead", *(each for one in felt for each in (one, command)), "stop"]
+    assert desk.told == [
+        "expect_velocities",
+        *(each for one in felt for each in (one, command)),
+        "stop",
+    ]
     assert controller.touches == [
         (pytest.approx(5.1), [(1.0, 1.0)]), (pytest.approx(5.2), []),
         (pytest.approx(5.3), [(pytest.approx(3.0), 3.0)]),

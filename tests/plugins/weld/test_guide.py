@@ -135,7 +135,7 @@ def test_the_guard_has_a_real_arm_while_it_is_driven_and_only_then(
         yield arm
         happened.append("guard ends")
 
-    monkeypatch.setattr(guide, "led", guarding)
+    monkeypatch.setattr(guide, "servo", guarding)
     recipe = loaded(HELD)
     recipe.context[RobotDriver] = RobotDriver("robot.ur_rtde", lambda: arm)
     guide_tactile.function(

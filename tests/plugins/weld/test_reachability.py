@@ -14,7 +14,7 @@ from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import LARGEST_TURN, Barred, Route
+from flangeye.motion.route import LARGEST_TURN, NoRoute, Route
 from flangeye_plugins.weld import reachability
 from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool, WorkSurface
@@ -52,7 +52,7 @@ def barred(table=False, itself=False, beyond=None, turn=0.0, fastest=0.1) -> Any
         apart=lambda axes: not itself,
     )
     found._fastest = lambda joints: fastest
-    return found._bars(np.zeros(2), np.radians([1.0, -turn]))
+    return found._obstacle(np.zeros(2), np.radians([1.0, -turn]))
 
 
 def test_of_all_that_bars_a_posture_the_first_is_told() -> None:
@@ -109,7 +109,7 @@ def chained(bars: dict[tuple[int, int], Barrier], starts: int = 2, stations: int
         assert abs(float(joints[0] - before[0])) < 0.011
         return bars.get(asked[-1])
 
-    found._bars = bars_of
+    found._obstacle = bars_of
     nowhere: Any = None
     named = [Station(f"at {i}", nowhere) for i in range(stations)]
     return found._drivable(named, postures)
@@ -129,7 +129,7 @@ def test_a_joint_that_goes_far_round_begins_a_turn_earlier(first: int, turned: i
     """Once around is 270 deg of a joint: it begins where all of that is within its limits."""
     box, full = np.zeros(3), np.radians([358.0])
     found = reach_of(limits=MotionLimits(box, box, 0.0, 0.0, 0.0, -full, full))
-    found._bars = lambda before, joints: None
+    found._obstacle = lambda before, joints: None
     way = np.radians(first + 15.0 * np.arange(19))
     postures = [np.array([[math.remainder(angle, math.tau)]]) for angle in way]
     (chain,) = found._drivable([None] * len(way), postures)
@@ -185,13 +185,13 @@ def test_the_way_is_taken_to_the_posture_that_is_nearest_and_free() -> None:
     free, other = Route(()), Route(())
     route, tried = started({2.0: other, -1.0: free, -3.0: other})
     assert route is free and tried == [-1.0]
-    route, tried = started({2.0: free, -1.0: Barred("a wall"), -3.0: other})
+    route, tried = started({2.0: free, -1.0: NoRoute("a wall"), -3.0: other})
     assert route is free and tried == [-1.0, 2.0]
     # Near is where the arm first comes to: it turns on from there whatever it has taken.
     route, tried = started({-1.02: free, 1.0: other})
     assert route is other and tried == [1.0]
     with pytest.raises(StageError) as told:
-        started({2.0: Barred("the far one"), -1.0: Barred("the near one")})
+        started({2.0: NoRoute("the far one"), -1.0: NoRoute("the near one")})
     assert str(told.value) == (
         "weld.tactile: no collision-free path from the arm's pose to the seam: the near one; "
         "bring the arm above the work by hand"
@@ -221,7 +221,7 @@ def test_a_way_goes_over_and_down_and_what_bars_it_first_is_told(
         def route(self, start: Any, goal: Any) -> Any:
             why = over if goal == "high" else down
             assert (start, goal) in (("here", "high"), ("high", "low"))
-            return Barred(why) if why else Route((goal,))
+            return NoRoute(why) if why else Route((goal,))
 
     monkeypatch.setattr(reachability, "Router", Router)
     full = np.full(2, 9.0)
@@ -233,9 +233,9 @@ def test_a_way_goes_over_and_down_and_what_bars_it_first_is_told(
         object.__setattr__(kept, "joint_speed", 2 * given)
         params = SimpleNamespace(approach_speed=0.1, approach_joint_speed=0.2)
         found = reach_of(model=None, limits=kept, params=params)
-        found._touches = lambda start, goal: Barred(touches) if touches else None
+        found._touches = lambda start, goal: NoRoute(touches) if touches else None
         way = found._way("here", "high", "low")
-        assert (way.reason if isinstance(way, Barred) else None) == told
+        assert (way.reason if isinstance(way, NoRoute) else None) == told
         if told is None:
             assert way.legs == ("high", "low")
         assert (asked[-1].speed, asked[-1].joint_speed) == (slower, 2 * slower)

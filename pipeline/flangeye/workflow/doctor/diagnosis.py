@@ -252,7 +252,7 @@ class Finding:
     note: bool = False
 
     @property
-    def hopeless(self) -> bool:
+    def needs_new_recordings(self) -> bool:
         """Whether the mistake surely affects most samples, so that only new recordings help."""
         certain = self.gain == math.inf and bool(self.samples)
         return certain and self.corrected_session is None and not self.note
@@ -360,11 +360,11 @@ def examine(
 
     found, current = [r for r in session.remarks if not r.note], session
     known = tuple(remark for remark in session.remarks if remark.note)
-    if any(remark.hopeless for remark in found):
+    if any(remark.needs_new_recordings for remark in found):
         return diagnosed(found, known, {})
     require_enough(int(session.seen.sum()), len(session), session.remarks, session.damage)
     offered, idle = _offered(current, bound, checked)
-    if made_up := [f for f in offered if f.hopeless]:
+    if made_up := [f for f in offered if f.needs_new_recordings]:
         # What else these samples seem to show is made up like them.
         return diagnosed([*found, made_up[0]], known, idle)
     while mendable := [f for f in offered if f.corrected_session is not None and not f.note]:

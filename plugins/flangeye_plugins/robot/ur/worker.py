@@ -324,7 +324,7 @@ def one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def take_precedence() -> None:
+def take_realtime_priority() -> None:
     """Request real-time priority; without the right to, the priority stays normal."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -358,7 +358,7 @@ def connect(host: str) -> Any:
 def main(host: str, period: float, memory: int, channel: int, reads_only: bool) -> None:
     """Connect, report success, and serve requests."""
     # First of all, so that the library's threads are as punctual.
-    take_precedence()
+    take_realtime_priority()
     line = socket.socket(fileno=channel)
     shared = mmap.mmap(memory, MEMORY)
     try:

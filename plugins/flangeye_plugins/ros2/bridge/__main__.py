@@ -237,7 +237,7 @@ def answer(bridge: BridgeNode, request: Request) -> Request:
     return {"given": given}
 
 
-def be_punctual() -> None:
+def take_realtime_priority() -> None:
     """Request real-time priority for this process, if permitted.
 
     An arm is supervised through this process, and a late process loses clouds sent without
@@ -250,7 +250,7 @@ def be_punctual() -> None:
 def main() -> None:
     """Create the node, report success, and serve requests."""
     output = FramedOutput()
-    be_punctual()
+    take_realtime_priority()
     rclpy.init()
     node = rclpy.create_node(
         f"flangeye_{os.getpid()}", enable_rosout=False, start_parameter_services=False

@@ -136,7 +136,7 @@ def predicted(
     return Predicted(s, fixed, *varying(prior, settings, learned, press, stance))
 
 
-def beforehand(prior: ModelPrior, settings: Following) -> tuple[SweepFit, float]:
+def best_sweep_fit(prior: ModelPrior, settings: Following) -> tuple[SweepFit, float]:
     """Return the best calibration that the sweep can give, and the deflection of the tip [m]."""
     # Between two walls the sweep measures the tip's position along the tool.
     ahead = min(prior.ahead_known, PIVOTED if prior.two_walls else math.inf)
@@ -161,7 +161,7 @@ def check_bound(plan: Path, prior: ModelPrior, settings: Following) -> None:
     Raises:
         StageError: The message names the worst place, the largest part there and a remedy.
     """
-    found = predicted(plan, prior, settings, *beforehand(prior, settings))
+    found = predicted(plan, prior, settings, *best_sweep_fit(prior, settings))
     worst = int(np.argmax(found.variance))
     sigmas = along(plan, prior, settings)
     bound = sigmas * float(np.sqrt(found.variance[worst]))

@@ -28,7 +28,7 @@ class WeaveOffset(NamedTuple):
     rate: float = 0.0
     rush: float = 0.0
 
-    def led(self, lag: float) -> WeaveOffset:
+    def for_lag(self, lag: float) -> WeaveOffset:
         """Return the weave to command so that an arm with this lag [s] follows this weave."""
         # (1 + lag d/dt) undoes a first-order lag, 1 / (1 + lag s)
         return WeaveOffset(self.aside + lag * self.rate, self.rate + lag * self.rush, self.rush)
@@ -211,7 +211,7 @@ class TorchLead:
             self._swings = now + arm.dead_time
         elapsed = -1.0 if self._swings is None else now - self._swings
         self.aim = self._beside + self.weave.at(elapsed).aside
-        return self.weave.at(elapsed + arm.dead_time).led(arm.lag)
+        return self.weave.at(elapsed + arm.dead_time).for_lag(arm.lag)
 
     def turn(
         self, velocity: Floats, coming: ToolPose, normal: Floats, off: float, sway: WeaveOffset

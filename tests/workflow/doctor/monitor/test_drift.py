@@ -209,7 +209,7 @@ def test_a_scanner_knocked_by_millimetres_is_found_at_once_and_named() -> None:
 
 
 def test_a_joint_re_mastered_is_named() -> None:
-    from flangeye.estimation.watch.blame import blame, suspects
+    from flangeye.estimation.watch.attribution import attribute_change, suspects
     from tools.checked_year import ABOUT, step_at
 
     wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))
@@ -218,7 +218,7 @@ def test_a_joint_re_mastered_is_named() -> None:
     found = verdict(known, Prior(Information.of_covariance(watched.prior)), CORNERS, DriftTest())
     assert found.state == "MOVED" and found.since is not None
     before = Information.of_covariance(watched.prior).plus(known.summed(10, 40))
-    parts = blame(before, watched.sightings.of(40, 46), ABOUT, watched.scanner, 3e-5)
+    parts = attribute_change(before, watched.sightings.of(40, 46), ABOUT, watched.scanner, 3e-5)
     assert suspects(parts)[0][0] == "arm"
     assert max(parts, key=lambda part: parts[part]) == "joint 3 re-mastered"
 

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.estimation.watch.blame import blame, explained, suspects
+from flangeye.estimation.watch.attribution import attribute_change, explained, suspects
 from flangeye.estimation.watch.drift import (
     CheckSightings,
     DriftTest,
@@ -120,7 +120,9 @@ def _blamed(
         checks.summed(max(found.since - test.reference, 0), found.since)
     )
     scanner = stored.estimate.transform.translation
-    parts = blame(before, sightings.of(found.since, n), stored.estimate.about, scanner, test.daily)
+    parts = attribute_change(
+        before, sightings.of(found.since, n), stored.estimate.about, scanner, test.daily
+    )
     (suspect, probability), *_ = suspects(parts)
     # The arm's parts are named by their joints too; `suspects` has added these up
     words = {"arm": ("arm", "joint")}.get(suspect, (suspect,))

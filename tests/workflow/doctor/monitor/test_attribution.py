@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flangeye.estimation.watch.blame import _noise, blame, explained, suspects
+from flangeye.estimation.watch.attribution import _noise, attribute_change, explained, suspects
 from flangeye.estimation.watch.drift import CheckSightings, Information, allowance
 from flangeye.types import Floats
 from flangeye.types.geometry import hat
@@ -28,8 +28,8 @@ def thought(sign: float = 1.0) -> tuple[Information, CheckSightings]:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_who_is_blamed_does_not_depend_on_where_motions_are_taken_from(sign: float) -> None:
-    plain = blame(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
-    moved = blame(*thought(sign), ABOUT, WATCHED.scanner, DAILY)
+    plain = attribute_change(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
+    moved = attribute_change(*thought(sign), ABOUT, WATCHED.scanner, DAILY)
     assert sum(plain.values()) == pytest.approx(1.0)
     assert moved == pytest.approx(plain, rel=1e-6)
     assert [p for _, p in suspects(plain)] == sorted((p for _, p in suspects(plain)), reverse=True)
@@ -68,8 +68,8 @@ def test_blame_is_the_same_with_weights_of_the_arm_that_do_nothing() -> None:
     more = replace(SEEN, effects=np.concatenate([SEEN.effects, np.zeros((n, 5, 2))], axis=2))
     wide = np.eye(8)
     wide[:6, :6] = WATCHED.prior
-    plain = blame(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
-    weighed = blame(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
+    plain = attribute_change(BEFORE, SEEN, ABOUT, WATCHED.scanner, DAILY)
+    weighed = attribute_change(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
     assert weighed == pytest.approx(plain, rel=1e-6)
     assert explained(Information.of_covariance(wide), more, ABOUT, WATCHED.scanner, DAILY)
 
@@ -112,7 +112,7 @@ def test_each_part_is_as_likely_as_what_it_does_by_a_millimetre_or_milliradian()
         for part, spread in does.items()
     }
     expected = {part: each / sum(density.values()) for part, each in density.items()}
-    assert blame(NOTHING, seen, above, above, 1e-9) == pytest.approx(expected, rel=1e-3)
+    assert attribute_change(NOTHING, seen, above, above, 1e-9) == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_joint_by_itself_or_the_arm_is_blamed_by_what_joints_do() -> None:
@@ -121,7 +121,7 @@ def test_a_joint_by_itself_or_the_arm_is_blamed_by_what_joints_do() -> None:
     columns[0, 0, 0], columns[0, 1, 1], columns[0, 2, 2] = 0.5, 0.7, 0.9
     seen = replace(one_sighting(np.array([0.0, 2e-3, 0.0, 0.0, 0.0])), joints=columns)
     above = np.array([0.0, 0.0, 1.0])
-    parts = blame(NOTHING, seen, above, above, 1e-9)
+    parts = attribute_change(NOTHING, seen, above, above, 1e-9)
     assert {p for p in parts if "re-mastered" in p} == {
         "joint 2 re-mastered", "joint 3 re-mastered", "arm re-mastered",
     }  # fmt: skip

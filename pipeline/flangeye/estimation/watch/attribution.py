@@ -19,7 +19,7 @@ PART_CHANGE = 1e-3
 """Prior standard deviation of a part's change [rad] or [m]."""
 
 
-def blame(
+def attribute_change(
     before: Information, after: CheckSightings, about: Floats, scanner: Floats, daily: float
 ) -> Mapping[str, float]:
     """Return each part's probability of having caused a change, likeliest first.
