@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from flangeye_plugins.robot.franky import (
 )
 from tests.emulators.controllers.process import free_address
 from tests.plugins.robot.cell import in_time, moved
-from tests.plugins.robot.franky_stand_in import PANDA, StandIn
+from tests.plugins.robot.franky_stand_in import JOINT_SPEED, PANDA, StandIn
 
 franky = pytest.importorskip("franky")
 
@@ -151,6 +152,22 @@ def test_a_joint_move_goes_where_it_should(robot: Any) -> None:
         states.append(robot.state())
     np.testing.assert_allclose(states[-1].joints, target, atol=1e-9)
     assert np.abs([s.joint_speeds for s in states]).max() == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_slower_move_than_a_thousandth_of_the_limit_has_that_speed(robot: Any) -> None:
+    robot.move_joints(robot.state().joints + 0.1, speed=1e-4, acceleration=1.0)
+    for _ in range(50):
+        state = robot.state()
+    assert np.abs(state.joint_speeds).max() == pytest.approx(1e-3 * JOINT_SPEED)
+
+
+def test_a_cycle_ends_with_the_millisecond(robot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot.close()  # what looks for silence waits by the same clock
+    slept: list[float] = []
+    clock = SimpleNamespace(monotonic=lambda: 100.0004, sleep=slept.append)
+    monkeypatch.setattr("flangeye_plugins.robot.franky.time", clock)
+    robot.wait_cycle()
+    assert slept == [pytest.approx(0.0006)]
 
 
 def test_a_velocity_is_followed_and_ends(robot: Any) -> None:
