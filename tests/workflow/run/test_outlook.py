@@ -15,7 +15,7 @@ from flangeye.types.geometry import rigid, rotation_exp
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.folder import RunFolder
-from flangeye.workflow.run.outlook import Outlook, outlook, outlook_of_log
+from flangeye.workflow.run.outlook import Outlook, motions_to_add, outlook, outlook_of_log
 from flangeye.workflow.run.session import Start, record_run
 
 RECIPE = """title: ready-made centres
@@ -77,6 +77,18 @@ def test_it_names_the_motion_that_is_missing(run: Path) -> None:
     assert f"missing: {few.missing}" in few.lines()
     still = [*log.observations()[:1]] * 5
     assert "move the arm" in outlook(recipe, registry, still, t.Source(fingerprint="")).missing
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_work_that_is_covered_is_that_of_the_log_s_source(run: Path, known: bool) -> None:
+    log, registry = read_run(run), load_registry()
+    assert log.source is not None
+    far = t.Box(np.array([9.0, 0.0, 0.4]), np.full(3, 0.3))  # beyond all poses
+    log.source = replace(log.source, workspace=far) if known else None
+    found = outlook_of_log(log, registry)
+    assert found.coverage is not None
+    assert bool(found.coverage.places[1:].any()) is not known  # all in the nearest layer
+    assert motions_to_add(log, registry) == found.better
 
 
 def test_coverage_counts_cells_and_turns() -> None:
