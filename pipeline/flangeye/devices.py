@@ -39,9 +39,9 @@ GRACE = 0.1
 """An arm that goes at a velocity brakes when the next command is this late [s]."""
 
 SILENT = 0.15
-"""Longest silence while an arm moves [s]: of who reads its state, of its guard, of the program. An
-arm at 0.5 rad/s takes another 0.12 s to brake, so it rests within 0.3 s; a machine that keeps a
-process from the processor for so long is too busy to move an arm."""
+"""Longest time without a read of a moving arm's state, a cycle of its guard, or a heartbeat of the
+program [s]. An arm at 0.5 rad/s takes another 0.12 s to brake, so it is at rest within 0.3 s. A
+computer that halts a process for so long is too busy to move an arm."""
 
 Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not ready"]
 
@@ -435,8 +435,8 @@ Kind = Literal["programs", "libraries"]
 def _name(value: Any) -> str:
     if not isinstance(value, str) or not re.fullmatch(r"\w[\w.-]*", value, re.ASCII):
         raise ValueError(
-            "is the name of an entry of this machine's settings, never a path: a recipe cannot say "
-            "what is run or loaded (flangeye's documentation: what a recipe can open)"
+            "is the name of an entry of this machine's settings, never a path: a recipe may not "
+            "choose programs or libraries (flangeye's documentation: what a recipe can open)"
         )
     return value
 
@@ -479,8 +479,8 @@ def require_named(kind: Kind, name: str, asker: str) -> Path:
     if path is None:
         known = ", ".join(sorted(_entries(kind))) or "none"
         raise DeviceError(
-            f"{asker}: this machine names no '{name}' (it names: {known}); a recipe cannot say "
-            f'what is run or loaded: write {name} = "/its/path" under [{kind}] in '
+            f"{asker}: this machine names no '{name}' (it names: {known}); a recipe may not "
+            f'choose programs or libraries: write {name} = "/its/path" under [{kind}] in '
             f"{settings_file()}"
         )
     return path

@@ -58,7 +58,9 @@ def scanner_mounted(model: ScannerModel | None, params: MountedParams) -> Scanne
         DeviceError: The recipe has no scanner model, or no simulated arm carries the scanner.
     """
     if model is None:
-        raise DeviceError("scanner.mounted: the recipe must say which scanner to be: scanner.model")
+        raise DeviceError(
+            "scanner.mounted: the recipe must name the scanner to simulate: scanner.model"
+        )
     if bench.newest() is None:
         raise DeviceError(
             "scanner.mounted: no simulated arm carries it; give the recipe robot.driver: simulated"
@@ -137,7 +139,7 @@ def scanner_loopback(model: ScannerModel | None, params: LoopbackScannerParams) 
     """
     if model is None:
         raise DeviceError(
-            "scanner.emulator: the recipe must say which scanner to be: scanner.model"
+            "scanner.emulator: the recipe must name the scanner to simulate: scanner.model"
         )
     try:
         control = EmulatorControl(address_of(params.host), patience=PATIENCE)

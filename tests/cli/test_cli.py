@@ -277,7 +277,7 @@ def test_ctrl_c_keeps_what_was_gathered(
         (("--resume", "done"),
          "error: done/run.mcap: this run is complete; there is nothing to resume "
          "(--retake ID takes a capture again)"),
-        (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy begins anew each time"),
+        (("--resume", "torn.mcap"), "error: torn.mcap: acquire.toy cannot be resumed"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_gone_on_with_is_said(

@@ -99,7 +99,7 @@ def test_a_home_of_another_arm_and_an_offline_move_are_refused(tmp_path: Path) -
         ),
         (
             ("--offline", "--move"),
-            "error: --move and --offline: an arm that is not asked cannot be moved",
+            "error: --move and --offline: leave out one; --offline connects to no arm",
         ),
         (("--json", "--move"), "error: --move and --json: only the plan is printed as JSON"),
     ]:

@@ -107,6 +107,7 @@ def end_in_words(command: Callable[[], object]) -> None:
         _fail(error)
     except MemoryError as error:
         _fail(FlangeyeError(f"not enough memory: {str(error) or 'the machine has no more'}"))
+    # The reader, such as head, has what it wanted: this is no failure
     except BrokenPipeError:
         _discard_output()
         sys.exit(0)
@@ -122,6 +123,7 @@ def _open_streams() -> None:
     """Make sure that both output streams are open and can encode any text."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
+        # A parent process may have closed it
         if stream is None:
             setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
         elif isinstance(stream, io.TextIOWrapper):

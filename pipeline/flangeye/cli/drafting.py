@@ -64,6 +64,7 @@ def _with_answers(command: Any) -> Any:
     ]  # fmt: skip
     folder, ros2, *rest, _ = signature(command, eval_str=True).parameters.values()
     flags = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in rest]
+    # typer reads a command's options from its signature
     command.__signature__ = Signature([folder, ros2, *answers, *flags])
     command.__annotations__ |= {each.name: each.annotation for each in answers}
     return command
@@ -99,6 +100,7 @@ def init(
     texts = {**draft.files, out: draft.text}
     new = [path for path in texts if not path.exists()]
     for path in set(texts) - set(new):
+        # An equal file, such as a model that an earlier try has written, may stay
         if path.read_bytes() != texts[path].encode():
             raise RecipeError(f"{path}: exists already; choose another name with --out")
     try:
@@ -136,12 +138,13 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
         return draft_recipe(survey, out, questions, registry)
     if "fit.rim" not in draft.text or _seen(draft, survey.folder, out, registry, 1) != []:
         return draft
+    # The scanner's range tells metres from millimetres; centimetres lie between, so they are tried
     in_cm = replace(draft, text=draft.text.replace("archive: {", "archive: {unit: cm, ", 1))
     if _seen(in_cm, survey.folder, out, registry, 1):
-        questions.assumed.append("clouds in cm: read in m or mm, no scan shows the flange")
+        questions.assumed.append("unit of the clouds: cm, as in m or mm no scan shows the flange")
         return in_cm
     questions.given["target"] = None
-    seen = "what is seen instead, 'body: gripper.stl' for a tool by its mesh"
+    seen = "which target they show ('body: gripper.stl' for a tool by its mesh)"
     questions.ask("target", f"no scan shows the flange; {seen}", "flange")
     return draft_recipe(survey, out, questions, registry)
 

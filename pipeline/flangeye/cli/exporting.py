@@ -73,6 +73,7 @@ def export(
         return
     file = _exported(run, to.removeprefix("export."), values or [], anyway, camera)
     if out == Path("-"):
+        # Unchanged, byte by byte: another program reads it
         typer.echo(file.text, nl=False)
         return
     path = out or (run if run.is_dir() else run.parent) / "exports" / file.name

@@ -73,7 +73,7 @@ def _replay(log: Path) -> None:
     from flangeye.workflow.run.replay import replay_steps
 
     same = True
-    with at_work("repeating"), of_foreign(log, "its decisions cannot be made again"):
+    with at_work("repeating"), of_foreign(log, "its decisions cannot be repeated"):
         redone_steps = list(replay_steps(log, load_plugins()))
     for step, redone in redone_steps:
         say(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")

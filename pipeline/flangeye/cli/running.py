@@ -118,7 +118,7 @@ def run(  # noqa: PLR0913  one for each option
     from flangeye.workflow.run.folder import RunFolder
     from flangeye.workflow.run.session import Start
 
-    _refuse(move and offline, "--move and --offline: an arm that is not asked cannot be moved")
+    _refuse(move and offline, "--move and --offline: leave out one; --offline connects to no arm")
     _refuse(move and json_, "--move and --json: only the plan is printed as JSON")
     lonely = (retake and not resume) or (leave_out and not source)
     _refuse(lonely, "--retake goes with --resume RUN, --leave-out with --from RUN.MCAP --at STEP")
@@ -135,6 +135,7 @@ def run(  # noqa: PLR0913  one for each option
         results = stack.enter_context(results_at(out))
         recordings = stack.enter_context(archive_at(archive))
         start = Start(ArchivePath(recordings), point, MotionAllowed(move, offline, json_))
+        # Last, so that a wrong recipe or archive leaves no empty folder
         folder = RunFolder.create(checked.name, results)
         with _plan_as_json() if json_ else nullcontext():
             result = _record(checked, recipe or checked.name, registry, folder, start)

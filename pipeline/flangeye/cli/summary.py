@@ -191,6 +191,8 @@ class RunProgress:
     ) -> None:
         """Note which steps run for each capture, and count those that run once."""
         if step in self._once and capture is not None:
+            # A step that runs for each capture, and those before it, are not among the steps that
+            # run once
             del self._once[: self._once.index(step) + 1]
         elif step in self._once:
             self._once.remove(step)

@@ -50,7 +50,7 @@ def touch_points(  # noqa: PLR0913  one for each option
     log = read_run(run)
     calibration = log.calibration()
     if calibration is None:
-        raise StageError(f"{log.path}: holds no calibration, so nothing is predicted")
+        raise StageError(f"{log.path}: holds no calibration; name a run that has one")
     try:
         predicted = calibration.base_T_camera.transform.apply(seen)
     except FrameMismatchError as error:

@@ -89,10 +89,12 @@ def monitor(  # noqa: PLR0913  one argument an option
     url, node = _opcua_node(opcua, opcua_security) if opcua else ("", "")
     stored = stored_calibration(calibration)
     place = history or history_beside(stored.path)
+    # A damaged history is refused before the arm moves
     kept = History.read(place, stored.key)
     registry = load_plugins()
     for check in _checks(stored, registry, archive, (scans, move), overrides or ()):
         with only_user(place):
+            # Again, under the lock: another program may have added a check
             kept = History.read(place, stored.key)
             finding = take(stored, kept, check, test)
             kept.write()

@@ -21,7 +21,7 @@ from flangeye.models.cell import Frame, chain
 from flangeye.types import Floats, Indices
 from flangeye.types.geometry import invert, rotation_exp, rotation_log
 
-OPTIMAL = "globally optimal: nowhere is there an answer that fits the agreeing poses better"
+OPTIMAL = "globally optimal: no other answer fits the inlier poses better"
 NOT_CERTIFIED = "not certified as globally optimal"
 
 
@@ -159,7 +159,7 @@ def certificate_notes(answer: CertifiedAnswer) -> tuple[str, ...]:
 
 def moved_note() -> str:
     """Return the note for an answer that the certificate has improved."""
-    return "what the search had found was not the best: the certificate led to a likelier answer"
+    return "the certificate found a likelier answer than the search; it is used"
 
 
 def _named(places: Floats | None, root: str, answer: CertifiedAnswer) -> dict[str, Floats] | None:

@@ -258,7 +258,7 @@ def _checkerboard(board: Board, grey: Grey, thorough: bool) -> Corners | Rejecte
     wrong = _wrong_squares(upright, board, grey)
     if wrong:
         return Rejected(
-            f"{wrong} of the {board.columns} x {board.rows} squares are not as they should be: a "
+            f"{wrong} of the {board.columns} x {board.rows} squares have the wrong colour: a "
             "part of the board is covered or cut off, or it has more squares"
         )
     return upright

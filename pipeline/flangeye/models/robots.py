@@ -79,9 +79,9 @@ class Joint(Model):
     rpy: tuple[Angle, Angle, Angle] = param(("0 deg",) * 3)
     """Convention urdf: roll, pitch, yaw of its frame in that frame."""
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Convention urdf: what it turns about, in its own frame."""
+    """Convention urdf: the joint's axis, in its own frame."""
     slides: bool = False
-    """Whether it slides, as a rail does; it turns else."""
+    """Whether the joint slides, as a rail does, instead of turning."""
     lower: JointPosition = param("-360 deg")
     upper: JointPosition = param("360 deg")
 

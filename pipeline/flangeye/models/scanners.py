@@ -74,10 +74,10 @@ def middle_of_view(scanner: ScannerModel, base_T_camera: Floats) -> Floats:
 
 
 STATED_LIMIT = 20.0
-"""A stated unit is believed until the median point is this many times out of the scanner's range:
-no wall or window behind the robot is that far, and a wrong unit is off by 1,000."""
+"""Factor by which the median distance must be outside the scanner's range to refute a stated unit.
+No wall behind the robot is that far away, and a wrong unit is off by a factor of 1,000."""
 DETECTED_LIMIT = 5.0
-"""A unit is only detected where the median point is closer to the range than this."""
+"""Largest factor by which the median distance may be outside the range to detect a unit."""
 
 NAMES: Mapping[LengthUnit, str] = {
     "m": "metres", "mm": "millimetres", "cm": "centimetres", "in": "inches",

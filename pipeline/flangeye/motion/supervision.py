@@ -175,8 +175,8 @@ class Supervisor:
         # So long ready before the goal, its controller has ended the move [ns]
         if state.time_ns - self._ready_ns > 300_000_000:
             raise SafetyFault(
-                f"the arm ended its move {np.degrees(short):.1f} deg before the goal: its "
-                f"controller did, or this machine was too busy to watch it for {SILENT} s"
+                f"the arm stopped {np.degrees(short):.1f} deg before the goal: its controller "
+                f"ended the move, or this machine was too busy to read its state for {SILENT} s"
             )
 
     def _settled(self, state: RobotState, leg: Leg) -> bool:

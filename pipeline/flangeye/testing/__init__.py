@@ -89,7 +89,7 @@ class CheckConformance(Conformance):
             findings = list(self.call({}, recordings))
         except NotApplicable:
             return []
-        require(all(isinstance(f, Finding) for f in findings), "gave something else than Findings")
+        require(all(isinstance(f, Finding) for f in findings), "did not return Findings")
         return findings
 
     def test_it_gives_the_same_twice(self) -> None:
@@ -237,7 +237,7 @@ class ExportConformance(Conformance):
         """The stage writes a file with a plain name and text, wherever the camera is mounted."""
         for carrier in (t.BASE, t.FLANGE):
             file = self.file(carrier)
-            require(isinstance(file, t.ExportedFile), "gave something else than an ExportedFile")
+            require(isinstance(file, t.ExportedFile), "did not return an ExportedFile")
             require(bool(file.text.strip()), "the file is empty")
             plain = file.name not in ("", ".", "..") and not set("/\\") & set(file.name)
             require(plain, f"'{file.name}' is not a plain file name")

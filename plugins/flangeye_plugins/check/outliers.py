@@ -161,9 +161,9 @@ def _flipped(
 
 
 TOO_UNCERTAIN = np.radians(2.0)
-"""Uncertainty of the camera's rotation that is not an answer (one sigma) [rad]."""
+"""Standard deviation of the camera's rotation beyond which it counts as unknown [rad]."""
 SHIFT = 5e-3
-"""Uncertainty of a point of the work, seen by the camera, that is not an answer [m]."""
+"""Standard deviation of a point of the work beyond which its position is unknown [m]."""
 LITTLE = np.radians(10.0)
 """Poses that differ by less do not turn the target enough [rad]."""
 

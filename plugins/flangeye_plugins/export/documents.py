@@ -43,6 +43,7 @@ def ros2_command(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
     """Write the command that publishes the pose as a ROS 2 static transform."""
     command = ("ros2", "run", "tf2_ros", "static_transform_publisher")
     lines = [shlex.join([*command, *_arguments(each, params)]) for each in pose.each]
+    # A publisher runs until it is stopped, so all but the last go to the background
     text = pose.comment("#") + " &\n".join(lines) + "\n"
     if "\0" in text or not text.isascii():
         raise StageError("export.ros2_command: a name cannot be written as a word of a shell")
@@ -165,6 +166,7 @@ def robodk(pose: CalibratedPose, params: NamedParams) -> ExportedFile:
     matrix = "".join(f"    {row!r},\n" for row in rows)
     name = params.name
     added = (
+        # The parent of a robot in RoboDK is its base frame
         f"STATION.AddFrame({name!r}, ROBOT.Parent()).setPose(POSE)"
         if pose.stands
         else f"ROBOT.AddTool(POSE, {name!r})"
@@ -222,6 +224,7 @@ def urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
     robot = ElementTree.Element("robot", name=params.name)
     for line in pose.remarks:
         # No "--" may stand in a comment, nor "-" at its end (XML 1.0, 2.5).
+        # XML forbids two hyphens in a comment
         robot.append(ElementTree.Comment(f" {re.sub('-(?=-)', '- ', line)} "))
     for each in pose.each:
         robot.extend(_joints(each, params))
@@ -284,6 +287,7 @@ def _chain(file: Path, mount: str, optical: str) -> Floats:
                 f"{file}: no fixed joints lead from '{mount}' to '{optical}'; links with a fixed "
                 f"joint: {known}"
             )
+        # Popped, so that joints in a circle end in the error above
         joint = above.pop(link)
         pose, link = origin_of(file, joint) @ pose, end_of(joint, "parent")
     return pose

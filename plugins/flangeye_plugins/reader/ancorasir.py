@@ -148,6 +148,7 @@ def _sample_recording(where: str, key: str, entry: Any, cloud: Path) -> Recordin
         raise StageError(f"{where}: robot_pose or p_cam is missing or wrong ({error})") from None
     if pose.shape != (7,) or centre.shape not in ((0,), (3,)):
         raise StageError(f"{where}: robot_pose has {pose.size} numbers (7), p_cam {centre.size}")
+    # The sample's quaternions are w x y z, those of the other recordings x y z w
     w, *xyz = pose[3:]
     matrix = pose_from_quaternion(where, pose[:3], [*xyz, w])
     return Recording(key, {FLANGE: matrix}, cloud, centre if centre.size else None)

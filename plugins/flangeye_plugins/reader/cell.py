@@ -292,6 +292,7 @@ def _by_time(
     seen: CameraTable, moved: Sequence[PoseTable], params: PairingParams
 ) -> tuple[list[Recording], list[str]]:
     """Pair measurements with the first arm's standstills, at which all others must be at rest."""
+    # Values of an arm are poses (N, 4, 4), those of a rail or positioner numbers (N,)
     first = next((each for each in moved if each.values.ndim == 3), None)
     if first is None or first.times is None:
         raise StageError(f"{seen.text.file}: to join by time, name the table of an arm too")
@@ -343,6 +344,7 @@ def _signals(arm: Signal, events: Floats, values: Sequence[Floats | Path | None]
     tuple[Signal, Signal] | None
 ):  # fmt: skip
     whole = [v for v in values if isinstance(v, np.ndarray) and v.shape == (4, 4)]
+    # Only whole poses show an angular speed, which arm and target share in every frame
     if len(whole) < max(2, len(values)):
         return None
     return turning(*arm), turning(events, np.array(whole))
@@ -357,6 +359,7 @@ def _at(each: PoseTable, time: float) -> Floats:
 
 def _stands(each: PoseTable, found: MatchedPose, events: Floats) -> bool:
     """Return whether a carrier is at rest during the measurements of one standstill."""
+    # Half the time from the standstill's first measurement to its last [s]
     half = np.ptp(events[list(found.events)]) / 2
     before, after = (_at(each, found.time + side) for side in (-half, half))
     if each.values.ndim == 1:

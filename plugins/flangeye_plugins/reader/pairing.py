@@ -77,6 +77,7 @@ def pair(
     """
     spans = standstills(*arm)
     offset, told = _offset(spans, events, signals, params)
+    # Times of the measurements on the arm's clock [s]
     moved = events + offset
     overlap = (moved >= arm[0][0] - params.tolerance) & (moved <= arm[0][-1] + params.tolerance)
     if not overlap.any():

@@ -160,8 +160,10 @@ def _first_look(path: Path) -> Bag:
             bag.cameras[raw.topic] = raw.read(intrinsics_of)
             bag.seen_from[raw.topic] = raw.frame
         else:
+            # Clouds and images are large: they are decoded only after some of them are chosen
             bag.seen_from.setdefault(raw.topic, raw.frame)
             bag.stamps.setdefault(raw.topic, []).append(raw.stamp)
+    # A topic that was recorded without a message is no source
     return replace(bag, topics={t: kind for t, kind in bag.topics.items() if t in heard})
 
 
@@ -421,6 +423,7 @@ def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
 
 def _info(bag: Bag, params: BagParams, images: str) -> str | None:
     """Return the CameraInfo topic: the named one, or that of the images by name or frame."""
+    # By ROS convention a camera's CameraInfo is published beside its image
     beside = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
     frame = bag.seen_from[images]
     same = [topic for topic in bag.cameras if frame and bag.seen_from[topic] == frame]

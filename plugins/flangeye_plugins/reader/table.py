@@ -163,6 +163,7 @@ def _scan_column(text: Table, params: TableParams) -> int | None:
     scan = "scan"  # if the recipe does not say
     if scan in text.heading and number_of(first[text.index(scan)]) is None:
         return text.index(scan)
+    # A first column of text names the scans, unless the recipe names the pose's columns
     return 0 if number_of(first[0]) is None and not params.columns else None
 
 
@@ -216,6 +217,7 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
     found = [_named(folder, name) for name in named]
     if all(found):
         return [[path] for path in found if path], []
+    # The column may name rows instead of files: scans then match by name or number
     if not any(found) and all(named):
         called = replace(poses, names=[PurePath(name).stem for name in named])
         try:
@@ -249,6 +251,7 @@ def _measured(folder: Path, text: Table, poses: Floats, params: TableParams) -> 
     files = list(dict.fromkeys(file for table in tables for file in table.files))
     times = times_of(text, params.time, params.time_unit)
     joints = params.angles(text)
+    # Separate tables with times have their own clocks and rates; rows of one table belong together
     if times is not None and target.times is not None and target.table is not text:
         recordings, notes = _joined((times, poses), target, second, params)
         recordings = _with_joints(recordings, times, joints)

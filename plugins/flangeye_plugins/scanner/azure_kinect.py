@@ -140,6 +140,7 @@ class AzureKinect(OpenScanner):
         started = time.monotonic_ns()
         with contextlib.suppress(OSError):  # the answer says what became of the process
             self._pipe.write(b"next\n")
+        # The host waits for the camera first: its message says more than a timeout here
         answer = _answer(self._pipe, self._params.timeout + 0.5)
         depth = self._array(answer["depth"], np.uint16)
         colour = self._array(answer["colour"], np.uint8) if "colour" in answer else None

@@ -58,6 +58,7 @@ class DepthView:
         rows, columns = depth.shape
         pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
         flat = pixels.reshape(-1, 1, 2).astype(np.float64)
+        # Without a new camera matrix these are x / z and y / z
         rays = cv2.undistortPoints(flat, self.matrix, self.distortion).reshape(rows, columns, 2)
         xyz = np.dstack([rays, np.ones(depth.shape)]) * depth[..., None]
         return np.asarray(xyz, dtype=np.float32)
@@ -75,6 +76,7 @@ class DepthView:
         if self.colour is None:
             return None
         camera = self.colour
+        # Millimetres to metres, the unit of the camera's translation
         points = xyz.reshape(-1, 1, 3).astype(np.float64) / 1e3
         turn, _ = cv2.Rodrigues(np.array(camera.rotation))
         seen, _ = cv2.projectPoints(
@@ -82,8 +84,10 @@ class DepthView:
             np.array(camera.distortion),
         )  # fmt: skip
         at = np.nan_to_num(seen.reshape(*xyz.shape[:2], 2)).astype(np.float32)
+        # Outside the image, where remap writes black
         at[~xyz.any(axis=-1)] = -1
         mapped = cv2.remap(colour, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+        # BGRA to RGB
         rgb = np.ascontiguousarray(mapped[..., 2::-1])
         return Image(rgb, self.matrix, self.distortion)
 

@@ -88,6 +88,7 @@ class Realsense(OpenScanner):
         self._points = rs.pointcloud()
         self._closed = False
         if params.recording is not None:
+            # Frame by frame: in real time the SDK skips frames while the last one is processed
             device.as_playback().set_real_time(False)
         name = f"RealSense {_who(rs, device, params.recording)}"
         super().__init__(name, self._facts(profile), model)

@@ -117,6 +117,7 @@ class WatchedFolder(OpenScanner):
             for path in self._params.path.iterdir():
                 if _is_cloud(path) and path.match(self._params.pattern):
                     about = path.stat()
+                    # The inode shows a file that another one of equal size and time has replaced
                     found[path] = Stamp(about.st_ino, about.st_size, about.st_mtime_ns)
         except FileNotFoundError:
             if self._params.path.is_dir():
@@ -137,6 +138,7 @@ class WatchedFolder(OpenScanner):
         for path in sorted(new, key=_counted):
             before = self._arrivals.get(path)
             if before is None:
+                # The exposure may have begun right after the last look without the file
                 self._arrivals[path] = Arrival(there[path], now, self._looked_ns)
             elif before.stamp != there[path]:
                 self._arrivals[path] = before._replace(stamp=there[path], since=now)
@@ -153,6 +155,7 @@ class WatchedFolder(OpenScanner):
 
     def _take(self, path: Path, cloud: PointCloud) -> Callable[[], Scan]:
         arrival = self._arrivals.pop(path)
+        # A file that is exported again under this name has another stamp, and is a new scan
         self._known[path] = arrival.stamp
         ended = time.monotonic_ns()
 

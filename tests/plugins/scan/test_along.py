@@ -67,7 +67,7 @@ def test_a_place_outside_the_box_is_named() -> None:
 
 
 def test_a_mounted_scanner_needs_a_model_and_an_arm(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(DeviceError, match="must say which scanner to be: scanner.model"):
+    with pytest.raises(DeviceError, match="must name the scanner to simulate: scanner.model"):
         scanner_mounted(None, MountedParams())
     monkeypatch.setattr(bench, "newest", lambda: None)
     with pytest.raises(DeviceError, match="no simulated arm carries it; give the recipe robot.dr"):

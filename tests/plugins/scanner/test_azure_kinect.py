@@ -152,8 +152,8 @@ def test_a_missing_recording_or_python_is_said(tmp_path: Path) -> None:
         f"scanner.azure_kinect: no recording at {path}"
     )
     assert refused(AzureKinectParams(python="other")) == (
-        "scanner.azure_kinect: this machine names no 'other' (it names: none); a recipe cannot say "
-        f'what is run or loaded: write other = "/its/path" under [programs] in {settings_file()}'
+        "scanner.azure_kinect: this machine names no 'other' (it names: none); a recipe may not "
+        f'choose programs or libraries: write other = "/its/path" under [programs] in {settings_file()}'
     )
 
 

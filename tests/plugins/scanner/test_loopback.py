@@ -151,7 +151,7 @@ def test_the_end_of_the_controller_is_the_end_of_the_scanner() -> None:
 @pytest.mark.parametrize(
     ("model", "changes", "message"),
     [
-        (None, {}, "scanner.emulator: the recipe must say which scanner to be: scanner.model"),
+        (None, {}, "scanner.emulator: the recipe must name the scanner to simulate: scanner.model"),
         (
             PHOXI,
             {"robot": "aubo-i5"},

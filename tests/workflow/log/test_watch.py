@@ -98,10 +98,10 @@ def test_no_run_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StageError) as error:
         watch_run(None, None, plain(), patience=0.2)
-    assert str(error.value) == "./runs: no run came to be watched within 0.2 s"
+    assert str(error.value) == "./runs: no run started within 0.2 s"
     with pytest.raises(StageError) as error:
         watch_run(tmp_path / "nowhere.mcap", None, plain(), patience=0.2)
-    assert str(error.value).endswith("nowhere.mcap: no run came to be watched within 0.2 s")
+    assert str(error.value).endswith("nowhere.mcap: no run started within 0.2 s")
 
 
 def test_a_run_that_is_still_to_come_is_waited_for(log: Any) -> None:

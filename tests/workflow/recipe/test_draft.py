@@ -132,7 +132,7 @@ def test_a_tool_is_the_target_by_its_mesh(folder: Path) -> None:
 def test_scans_without_a_flange_bring_up_the_mesh(folder: Path) -> None:
     clouds(folder)
     table(folder, "X,Y,Z,A,B,C", kuka)
-    assert "assumed: no scan shows the flange; what is seen instead, 'body:" in init()
+    assert "assumed: no scan shows the flange; which target they show ('body:" in init()
     (folder.parent / "recipe.yaml").unlink()
     said = init("--robot", "ur5", "--scanner", "none", "--camera", "base", "--rotation", "kuka",
                 "--pose", "base_T_flange",
@@ -145,7 +145,7 @@ def test_clouds_in_centimetres_are_known_by_the_flange(folder: Path) -> None:
     shutil.copy(SAMPLE / "poses.csv", folder)
     for path in SAMPLE.glob("*.pcd"):
         write_cloud(folder / path.name, read_cloud(path), "cm")
-    assert "assumed: clouds in cm: read in m or mm, no scan shows the flange" in init()
+    assert "assumed: unit of the clouds: cm, as in m or mm no scan shows the flange" in init()
     assert recipe(folder).steps[0].params.unit == "cm"
 
 

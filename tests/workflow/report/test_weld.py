@@ -83,12 +83,12 @@ def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged: Callable[.
 
 def test_the_deviation_is_the_torch_s_beside_the_seam(logged: Callable[..., Any]) -> None:
     drawn = traces(weld_drawing(facts(logged(WELD))).deviation)
-    x, y = drawn["believed, from the seam as felt"]
+    x, y = drawn["estimated, from the seam as felt"]
     assert x.min() >= 0.0
     np.testing.assert_allclose(y, 0.2, atol=1e-3)
     np.testing.assert_allclose(drawn["true, from the true seam"][1], 0.1, atol=1e-3)
     alone = traces(weld_drawing(facts(logged(WELD, scan=None))).deviation)
-    assert list(alone) == ["believed, from the seam as felt"]
+    assert list(alone) == ["estimated, from the seam as felt"]
 
 
 def test_the_phases_are_bands_over_the_deflection(logged: Callable[..., Any]) -> None:
@@ -143,7 +143,7 @@ def test_believed_and_true_torch_are_shown_with_the_band(logged: Callable[..., A
             facts(logged(replace(WELD, band=band, true_torch=path(0.46, 1.4e-3))))
         ).deviation
     )
-    np.testing.assert_allclose(drawn["believed, from the seam as felt"][1], 0.2, atol=1e-3)
+    np.testing.assert_allclose(drawn["estimated, from the seam as felt"][1], 0.2, atol=1e-3)
     np.testing.assert_allclose(drawn["true, from the true seam"][1], 0.3, atol=1e-3)
     np.testing.assert_allclose(drawn["95 % band"][1], 0.3, atol=1e-3)
     np.testing.assert_allclose(drawn["95 % band, right"][1], -0.3, atol=1e-3)

@@ -168,8 +168,8 @@ def test_what_a_result_asks_for_whatever_its_steps_noted() -> None:
 
 @pytest.mark.parametrize(
     ("expected", "told"),
-    [((0.5e-3, 0.9e-3), None), ((0.2e-3, 0.4e-3), "more than chance explains"),
-     ((1.0e-3, 1.8e-3), "less than chance explains")],
+    [((0.5e-3, 0.9e-3), None), ((0.2e-3, 0.4e-3), "significantly larger"),
+     ((1.0e-3, 1.8e-3), "significantly smaller")],
 )  # fmt: skip
 def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told) -> None:
     stated = sections.expected_error_result(calibration(expected=ExpectedError(*expected)))
@@ -178,5 +178,5 @@ def test_an_expected_error_that_poses_held_out_contradict_is_said(expected, told
     assert len(warnings) == (told is not None)
     assert all(told in text and "0.50 mm" in text for text in warnings)
     fixes = [w.fix for w in sections.standing_warnings(found) if "held-out" in w.text]
-    trusted = {"more": "trust the held-out", "less": "trust the expected"}[told[:4]] if told else ""
-    assert all(fix.startswith(trusted) for fix in fixes)
+    trusted = {"larger": "trust the held-out", "smaller": "trust the expected"}
+    assert all(fix.startswith(trusted[str(told).split()[-1]]) for fix in fixes)

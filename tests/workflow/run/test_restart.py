@@ -137,7 +137,7 @@ def test_a_folder_without_a_recipes_name_is_gone_on_with_too(
 @pytest.mark.parametrize(
     ("text", "recipe_too", "why"),
     [
-        (TOY_RECIPE, True, "acquire.toy begins anew each time"),
+        (TOY_RECIPE, True, "acquire.toy cannot be resumed"),
         (AGAIN, False, "holds no recipe; it cannot be resumed"),
     ],
 )

@@ -21,8 +21,8 @@ from flangeye.types import Floats
 from flangeye.types.geometry import levers, stack_rows
 
 TIMES = 1.1
-"""By how many times the file's calibration error may be more or less, one sigma: data sheets state
-it for every device of the type. Were it free, it would take what the arm does wrong."""
+"""Factor by which the true calibration error may differ from the file's, one sigma: data sheets
+state it for every device of the type. Without this prior it would absorb errors of the arm."""
 
 
 def scanner_effects(problem: Problem, scanner: ScannerModel | None) -> list[Effect]:

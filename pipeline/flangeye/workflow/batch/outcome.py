@@ -16,7 +16,7 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 ACCEPTED, FINISHED = STATUSES[:2], STATUSES[:3]
 
 MARKER = "session.json"
-"""Written last into a session's folder: it is whole, and need not be run again."""
+"""File that is written last into a session's folder: it shows that the session is complete."""
 
 
 @dataclass(frozen=True)

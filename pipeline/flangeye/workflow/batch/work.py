@@ -41,18 +41,18 @@ from flangeye.workflow.run.folder import RunFolder
 from flangeye.workflow.run.session import Start, record_run
 
 MAX_STARTS = 2
-"""A session whose worker died is tried once more, for a worker may die of something else."""
+"""Largest number of starts of a session: its worker may have died for another reason."""
 
 WORKER_DIED = (
     f"its worker died {MAX_STARTS} times while it ran: killed, out of memory, or a crash in "
     "native code"
 )
 STARTS = ".starts"
-"""Folder in the batch's folder with a file a running session, one byte a start."""
+"""Folder in the batch's folder with one file per running session, one byte per start."""
 
 
 READY = f"{STARTS}/ready"
-"""There while a batch runs: by it a worker knows that it sees the batch's folder."""
+"""A file that exists while a batch runs; by it a worker checks that it sees the folder."""
 
 
 @dataclass(frozen=True)

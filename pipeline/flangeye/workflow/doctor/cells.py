@@ -117,6 +117,7 @@ class CellSession:
             return replace(self, cell=cell)
         archive: Archive = getattr(recipe.steps[0].params, "reader")(self.tables)  # noqa: B009
         recorded = {recording.id: recording for recording in archive.recordings}
+        # Detections in scans are kept by id, so rows that are joined otherwise have none
         if any(o.id not in recorded for o in self.observations):
             raise StageError("other rows belong together")
         again = [_recorded(o, recorded[o.id], cell) for o in self.observations]

@@ -134,6 +134,7 @@ class Recorder:
         cloud, now = capture.cloud, time.time_ns()
         meta = _plain(capture) | {
             "shape": list(cloud.xyz.shape),
+            # A capture without points, such as an image, lacks nothing
             "full": self._full or not cloud.xyz.size,
             "step": step,
             "seconds": seconds,
@@ -243,6 +244,8 @@ class Recorder:
         for capture, cloud in self._flanges.items():
             place, pose = found[self._cameras.get(capture, t.CAMERA)], self._poses.get(capture)
             camera = t.Transform(place.parent, t.CAMERA, place.matrix)
+            # The pose of a camera in the hand is known in the flange, whose pose changes with the
+            # capture
             moved = pose @ camera if pose is not None and camera.parent == t.FLANGE else camera
             if moved.parent == t.BASE:
                 flange = moved.apply_cloud(cloud)

@@ -145,11 +145,16 @@ class LogFile:
         """Yield (opcode, content); a truncated last record is not damage."""
         magic = b"\x89MCAP0\r\n"
         begin = file.read(len(magic))
+        # A shorter file may have been begun just now
         if not magic.startswith(begin):
             raise NotMcapError
         self._crc = zlib.crc32(begin)
+        # A record is an opcode (1 byte), the length of its content (8 bytes, little-endian), and
+        # the content
         while len(head := file.read(9)) == 9:
             opcode, length = struct.unpack("<BQ", head)
+            # A length beyond MAX_RECORD is damage: the magic bytes in its place are reported as
+            # such below
             body = file.read(min(length, size)) if length <= MAX_RECORD else magic
             if len(body) < length:
                 if body.endswith(magic):  # the end is there, so nothing was being written
@@ -158,6 +163,7 @@ class LogFile:
                 return
             self._read += 9 + length
             yield opcode, body
+            # After the yield, since the record DATA_END is not part of the checksum that it states
             self._crc = zlib.crc32(body, zlib.crc32(head, self._crc))
 
     def _taken(self, opcode: int, body: bytes) -> Iterator[LogMessage]:
@@ -179,6 +185,7 @@ class LogFile:
             if metadata.name == HASHES:
                 self._hashes.update(metadata.metadata)
         elif opcode == Opcode.DATA_END:
+            # 0 means that the writer computed no checksum (MCAP specification)
             if self._sound and records.DataEnd.read(stream).data_section_crc not in (0, self._crc):
                 raise DamageError("the log's checksum does not match: it was changed or damaged")
         elif opcode == Opcode.FOOTER:
@@ -228,6 +235,7 @@ class LogFile:
             at += 9 + length
 
     def _expand(self, chunk: Chunk) -> bytes:
+        # Both limits are checked before anything expands: a few bytes may stand for terabytes
         if chunk.uncompressed_size > MAX_CHUNK:
             raise DamageError(
                 f"a chunk says that it expands to {chunk.uncompressed_size} bytes; at most "
@@ -244,6 +252,7 @@ class LogFile:
         return content
 
     def _attach(self, attachment: Any, body: bytes) -> None:
+        # The last four bytes of the record are its CRC-32; 0 if there is none
         stated = int.from_bytes(body[-4:], "little")
         if stated not in (0, zlib.crc32(body[:-4])):
             raise DamageError(
@@ -266,6 +275,7 @@ def _decompressed(chunk: Chunk) -> bytes:
     if chunk.compression == "zstd":
         import zstandard
 
+        # A frame states the window that its decoder has to allocate, up to gigabytes
         with zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK).stream_reader(
             chunk.data
         ) as reader:

@@ -171,10 +171,10 @@ class SphereSection(RecipeSection):
     """A calibration sphere."""
 
     diameter: Annotated[Length, Field(gt=0)] | Literal["unknown"]
-    """unknown costs the depth of its centre most of its accuracy."""
+    """If it is unknown, the depth of the sphere's centre is far less accurate."""
     centre: tuple[Length, Length, Length]
-    """Where its centre is in the frame that carries it; in the flange frame the origin is in the
-    face and z points outwards."""
+    """Position of the sphere's centre in the frame that carries it; in the flange frame the origin
+    is in the face and z points outwards."""
 
 
 class FeatureSection(RecipeSection):

@@ -130,7 +130,7 @@ def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figu
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
     for name, line, torch, colour in (
-        ("believed, from the seam as felt", weld.refined, weld.torch, SERIES["circle"]),
+        ("estimated, from the seam as felt", weld.refined, weld.torch, SERIES["circle"]),
         ("true, from the true seam", truth, true_torch, SERIES["truth"]),
     ):
         if line is not None and len(line) > 1:
@@ -313,16 +313,16 @@ def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
 def _figure(name: str, value: float) -> tuple[str, str]:
     """Return a figure in words, and its value with its unit; another step's by its own name."""
     words, unit = {
-        "seen": ("Seen of the part, of its broadest side", "%"),
-        "refuted": ("Of the part looked through", "%"),
-        "second": ("Next best pose agrees, of the best", "%"),
-        "explained": ("Explained by the joint", "%"),
-        "coverage": ("Seen of its length", "%"),
-        "residual": ("Scan off the surface", "mm"),
+        "seen": ("Visible share of the part's broadest side", "%"),
+        "refuted": ("Share of the part that the scanner sees through", "%"),
+        "second": ("Score of the next best pose, of the best", "%"),
+        "explained": ("Share of points on the joint", "%"),
+        "coverage": ("Visible share of its length", "%"),
+        "residual": ("Distance of the scan from the surface", "mm"),
         "registration": ("Line in the scan, one sigma", "mm"),
         "start": ("Start along the seam, one sigma", "mm"),
         "end": ("End along the seam, one sigma", "mm"),
-        "apart": ("Neighbouring clouds apart", "mm"),
+        "apart": ("Distance between neighbouring clouds", "mm"),
         "points": ("Points on the surface", ""),
         "edges": ("Points on its edges", ""),
     }.get(name, (name, ""))

@@ -101,12 +101,12 @@ def _unlike(result: Result) -> list[tuple[str, str]]:
     both = f"held-out error {held.rms * 1e3:.2f} mm rms, expected {expected.rms * 1e3:.2f} mm"
     if held.rms > expected.p95:
         fix = "trust the held-out error; flangeye doctor RUN looks for the cause"
-        return [(f"{both}: more than chance explains", fix)]
+        return [(f"{both}: significantly larger", fix)]
     fix = (
         "trust the expected error: held-out poses do not show what all poses share, such as the "
         "camera's own calibration"
     )
-    return [(f"{both}: less than chance explains", fix)]
+    return [(f"{both}: significantly smaller", fix)]
 
 
 def expected_error(result: Result) -> tuple[float, float] | None:

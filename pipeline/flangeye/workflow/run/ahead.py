@@ -49,6 +49,7 @@ class FinishedCall:
 def cores() -> int:
     """Return the number of worker threads: the process's cores, or OMP_NUM_THREADS."""
     told = os.environ.get("OMP_NUM_THREADS", "")
+    # In a batch job or container the process may use fewer cores than the machine has
     mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(mine or 1, int(told)) if told.isdigit() and int(told) else mine or 1
 
@@ -67,6 +68,8 @@ def worked_ahead(
     try:
         while (pulled := FinishedCall.of(partial(next, items))).error is None:
             waiting.append((pulled.value, pool.submit(work, pulled.value)))
+            # One item more than workers waits, so that no worker is idle while the consumer holds
+            # this thread
             while waiting and (len(waiting) > workers or waiting[0][1].done()):
                 yield _first(waiting)
         while waiting:

@@ -64,6 +64,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             if any(self.path.iterdir()):
                 return False
+            # Exclusive creation: of two runs that begin at once, one gets the folder
             with suppress(FileExistsError):
                 self.log.open("xb").close()
                 return True
@@ -89,6 +90,7 @@ class RunFolder:
         for name, text in recipe.items():
             self._write(name, text)
         self._write("result.json", dump_result(result.model_dump(mode="json")))
+        # Programs load this file without reading the status, so a refused pose is not in it
         if result.transforms and not result.refused:
             self._write("calibration.yaml", calibration_yaml(result))
         for name, text in result.exports.items():
@@ -98,6 +100,7 @@ class RunFolder:
         """Delete log and folder: the run ended before a result worth keeping."""
         with suppress(OSError):  # somebody else put something there
             self.log.unlink(missing_ok=True)
+            # rmdir fails on a folder that holds anything else, so no other run's files are lost
             self.path.rmdir()
             if self.path.parent.name in (RUNS.name, CHECKS_FOLDER):
                 self.path.parent.rmdir()

@@ -87,6 +87,8 @@ def result_of(
     calibration, pairs = outcome.calibration, outcome.pairs()
     scan = outcome.scan and replace(outcome.scan, truth=truths.seams)
     holdout = sections.holdout_result(outcome.verifications)
+    # The top level of result.json is for the arm as its controller reports it: readers that know
+    # nothing of the corrected arm command the robot correctly
     known = calibration.as_reported().correction if calibration else None
     result = r.Result(
         title=recipe.header.title,
@@ -180,5 +182,7 @@ class Stopwatch:
     def _charge(self) -> None:
         now = time.perf_counter()
         if self._running:
+            # A pulled stream nests its steps: the time since the last change is the innermost
+            # step's
             self.seconds[self._running[-1]] += now - self._since
         self._since = now

@@ -23,7 +23,7 @@ from flangeye.workflow.recipe.steps import Step
 from flangeye.workflow.run.folder import recipe_of_log
 
 Acquire = Callable[[], Any]
-"""Does the recipe's acquire step."""
+"""Runs the recipe's acquire step."""
 
 
 class _Named(Protocol):
@@ -71,7 +71,7 @@ class FromNothing:
 
     def given(self, step: Step) -> Any:
         """Return the logged result of a step that runs once, if it is not run again."""
-        raise NotImplementedError(f"{step.label} is to be done")
+        raise NotImplementedError(f"{step.label} has no logged result")
 
     def segmented(self, capture: str) -> t.FlangeCloud | None:
         """Return the flange in a capture that is not segmented again, or None."""
@@ -179,6 +179,7 @@ class FromLog(FromNothing):
     def rejections(self) -> list[t.Rejection]:
         """Return the captures rejected by the steps that are not repeated."""
         order = list(KINDS)
+        # The steps that run again decide anew about the captures that they rejected
         earlier = order[: order.index(self.kind)]
         why = "left out by --leave-out"
         named = [t.Rejection(each, "acquire", why) for each in sorted(self.left_out)]
@@ -216,6 +217,7 @@ class FromEarlierRun(FromNothing):
         """Return the source's stream, with the outcomes of the earlier captures."""
         stream: t.Captures | t.Observations = acquire()
         if isinstance(stream, t.Captures):
+            # An adaptive plan reads here which poses were visited; None: nothing was measured there
             stream.outcomes.update(dict.fromkeys(sorted(self.resumed.done)))
             kept = [o for o in self.log.observations() if o.id not in self.retaken]
             stream.outcomes.update({o.id: o for o in kept})
@@ -304,7 +306,7 @@ def earlier_run(
         going_on = [f"steps.{weld.index}.resume={log.path.absolute()}"]
         return recipe_of_log(log, registry, going_on, name), restart_at(log, recipe, weld.label)
     if not resumable(recipe):
-        raise StageError(f"{log.path}: {recipe.steps[0].stage.name} begins anew each time")
+        raise StageError(f"{log.path}: {recipe.steps[0].stage.name} cannot be resumed")
     segments = any(step.stage.kind == "segment" for step in recipe.steps)
     return recipe, FromEarlierRun(log, segments, _named("--retake", retaken, log))
 

@@ -121,15 +121,19 @@ class Runner:
         self._values[t.Views] = start.views()  # before an acquire step adds its own
         stream = start.stream(self._acquire)
         self._hooks.flangeye_run_started(source=stream.source, total=stream.total)
+        # No stage may see a simulation's truth: a solver could use the answer
         truth, stream.source = stream.source.truth, replace(stream.source, truth=None)
         self._outcome.source = stream.source
         self._values[t.Box] = self._values[t.Box] or stream.source.workspace
         for rejection in start.rejections():
             self._reject(rejection)
         taken = self._taken(stream)
+        # Captures to take again come first: an adaptive solver that already has enough from the
+        # earlier ones would never ask for them
         solvable = t.Observations(
             chain(islice(taken, start.first), self._gathered(), taken), stream.source, stream.total
         )
+        # The same list, not a copy: it grows while the solver pulls
         self._outcome.seen = solvable.seen
         self._values[t.Earlier] = t.Earlier(solvable.seen)
         self._values[t.Observations] = solvable
@@ -248,6 +252,8 @@ class Runner:
     def _may_work_ahead(self, stream: t.Captures) -> bool:
         steps = (*self._steps("segment"), *self._steps("fit"))
         needs = [need for step in steps for need in step.stage.needs.values()]
+        # Pulling the next capture early would move a real arm. A stage that logs, or reads the
+        # earlier observations, depends on the order
         return stream.recorded and cores() > 1 and not {t.StageLog, t.Earlier} & {*needs}
 
     def _ahead(self, stream: t.Captures) -> Generator[t.Capture | t.Rejection]:
@@ -263,6 +269,7 @@ class Runner:
         found: dict[str, FinishedCall] = {}
         given: dict[Any, Any] = {t.Capture: capture}
         for step in (*self._steps("segment"), *self._steps("fit")):
+            # Verifiers compare whole clouds, and the solver must not get these captures
             if step.stage.kind == "fit" and capture.role == "verification":
                 break
             done = FinishedCall.of(partial(_guarded, step, self._arguments(step, given)))
@@ -352,6 +359,7 @@ class Runner:
 
     def _calibrate(self, step: Step) -> None:
         found = _refined(self._once(step), self._outcome.calibration)
+        # Closed forms have no error model, so the mixed model predicts their error at the work
         if found.expected is None:
             found = self._with_expected_error(found)
         self._values[t.HandEye] = self._outcome.calibration = found
@@ -389,6 +397,7 @@ class Runner:
             raise CalibrationRefused("; ".join(failed))
         calibration = self._outcome.calibration
         if self._outcome.verifications and calibration is not None:
+            # Seam and weld stages take this type only: no torch moves by an unverified calibration
             values = {f.name: getattr(calibration, f.name) for f in fields(t.HandEye)}
             verified = t.VerifiedHandEye(**values, verifications=self._outcome.verifications)
             self._values[t.VerifiedHandEye] = self._outcome.calibration = verified
@@ -400,6 +409,7 @@ class Runner:
             so_far = result_of(self._outcome, self._recipe, self._registry, self._watch)
             pose = self._values[t.CalibratedPose] = calibrated_pose(so_far)
         for step in steps:
+            # A format for one pose would silently drop the other transforms of a cell
             if CELL not in step.stage.serves:
                 require_one(step.label, pose, so_far)
             file = self._call(step)
@@ -432,6 +442,8 @@ class Runner:
         self, step: Step, capture: str | None = None, given: Mapping[Any, Any] | None = None
     ) -> Any:
         before = self._watch.seconds[step.label]
+        # A worker thread may have run this call already; its time did not pass on this thread's
+        # clock
         done = self._done().get(step.label) if capture is not None else None
         if done is not None:
             self._watch.add(step.label, done.seconds)
@@ -439,6 +451,7 @@ class Runner:
         else:
             with self._watch.timing(step.label):
                 value = _guarded(step, self._arguments(step, given or {}))
+        # The acquire step's stream is lazy: its captures are logged when they are pulled
         if not isinstance(value, t.Stream):
             seconds = self._watch.seconds[step.label] - before
             if not isinstance(value, t.Rejected):

@@ -111,6 +111,7 @@ class Publisher(threading.Thread):
             *receive.getActualTCPPose(),
             *receive.getActualTCPForce(),
         ]
+        # A package that arrived meanwhile would mix the values of two cycles
         if receive.getTimestamp() != stamp:
             return None
         self._last = stamp
@@ -133,6 +134,7 @@ class Commander:
         remote: Whether the control is remote: 1, 0, or -1 if it cannot be queried.
     """
 
+    # RTDE's runtime_state of a program that plays
     playing: ClassVar[int] = 2
 
     def __init__(self, control: Any, receive: Any, period: float, memory: mmap.mmap) -> None:
@@ -156,6 +158,7 @@ class Commander:
     def move_joints(self, joints: Sequence[float], speed: float, acceleration: float) -> None:
         """Start a move to joint angles (6,) [rad]."""
         self._begin(self._control.stopJ)
+        # True: the call returns at once, and the move goes on
         self._require(self._control.moveJ(joints, speed, acceleration, True))
 
     def move_linear(self, pose: Sequence[float], speed: float, acceleration: float) -> None:
@@ -278,6 +281,7 @@ def ask_dashboard(host: str, patience: float = 1.0) -> Any:
         socket.create_connection((host, 29999), timeout=patience) as line,
         line.makefile("r", encoding="utf-8", errors="replace") as answers,
     ):
+        # The server greets first
         answers.readline()
 
         def ask(question: str) -> str:

@@ -388,7 +388,7 @@ def _log_to_come(run: Path | None, patience: float) -> Path:
     while (log := _log_of(run)) is None:
         if time.monotonic() - since > patience:
             where = "./runs" if run is None else run
-            raise StageError(f"{where}: no run came to be watched within {patience:g} s")
+            raise StageError(f"{where}: no run started within {patience:g} s")
         time.sleep(POLL)
     return log
 
