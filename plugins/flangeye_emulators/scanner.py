@@ -42,7 +42,7 @@ class MountedParams(ScannerQuality, BenchParams):
     # The scanner's true position in ``flange`` [m]
     mount: ClassVar[tuple[float, float, float]] = (0.06, 0.0, 0.04)
     seed: int = Field(0, ge=0)
-    """Draws noise, distortion and what lies about."""
+    """Seed of noise, distortion and clutter."""
 
     @property
     def flange_T_camera(self) -> Floats:
@@ -114,7 +114,7 @@ class LoopbackScannerParams(Params):
     # The wall and the stand are beside this box [m]
     workspace: ClassVar[tuple[float, float, float]] = (0.3, 0.3, 0.2)
     seed: int = Field(0, ge=0)
-    """Draws noise, distortion and dropped frames."""
+    """Seed of noise, distortion and dropped frames."""
     # Scale of the scanner's noise and distortion
     noise: ClassVar[float] = 1.0
     resolution: float = Field(0.35, gt=0, le=1)

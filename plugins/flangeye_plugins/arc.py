@@ -16,7 +16,7 @@ from flangeye.plugin.stage import Params, part
 
 
 class ManualArcParams(ArcTimes, Params):
-    """Parameters of ``arc.manual``; ``ignition`` is the time that the person has."""
+    """Parameters of ``arc.manual``; within ``ignition`` the person has to strike the arc."""
 
 
 class ManualArc(Device):

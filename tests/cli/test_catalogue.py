@@ -92,7 +92,7 @@ def test_a_whole_scanner_can_be_simulated(tmp_path: Path) -> None:
         (["new-scanner", "acme", "--near", "3", "--far", "900 mm"],
          "error: acme.yaml:2: near: '3' has no unit: a length needs one"),
         (["new-scanner", "acme", "--near", "900 mm", "--far", "300 mm"],
-         "error: acme.yaml:1: near, the least distance it sees at, is not below far"),
+         "error: acme.yaml:1: near must be below far"),
         (["new-robot", "mine", "--urdf", "nowhere.urdf"], "error: nowhere.urdf: "),
     ],
 )  # fmt: skip

@@ -31,7 +31,7 @@ from flangeye.types import Floats, Indices
 from flangeye.types.geometry import stack_rows
 
 TELLING = 150
-"""Sightings that sizes are found from: more change them by less than their priors' spread."""
+"""Most sightings used to estimate sizes; more change them by less than their priors' spread."""
 
 
 @dataclass(frozen=True, eq=False)

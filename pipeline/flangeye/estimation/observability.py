@@ -20,14 +20,14 @@ from flangeye.types import CAMERA, TARGET, Floats
 from flangeye.types.geometry import invert, kabsch, levers, rotation_exp, rotation_log, stack_rows
 
 FINEST_NOISE = 1e-5
-"""No scanner and arm together do better than 10 um; keeps exact inputs from seeming observable."""
+"""Smallest noise of scanner and arm together [m], so that exact inputs do not seem observable."""
 NO_MOTION = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
 
 IN_LINE = 0.1
 """Points lie on a line when they are no further from it than this share of its length."""
 UNKNOWN_SHARE = 0.1
-"""A frame of which a weak move has this share, or more, is one that it leaves unknown."""
+"""A frame counts as unknown if its share of a weak move is this or more."""
 
 Motion = TypeVar("Motion")
 Move = tuple[str, tuple[float, ...]]

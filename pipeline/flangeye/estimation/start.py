@@ -37,7 +37,7 @@ from flangeye.types.geometry import (
 )
 
 SETS = 80
-"""Small sets drawn: with 40 % of the sightings wrong, four are all right once in eight draws."""
+"""Number of small subsets drawn: with 40 % outliers, one subset of four in eight has none."""
 LEVER = 0.3
 """Lever that converts rotations to lengths [m]: a typical distance of a target."""
 START_NOISE = 0.2e-3, 0.1e-3

@@ -26,12 +26,12 @@ MIN_CAPTURES = 3
 MIN_SPREAD = 1e-3
 """Largest distance of a flange from their mean [m] below which the arm has not moved at all."""
 MAX_REACH = 20.0
-"""Distance from the base [m] that no arm has; metres read as millimetres lie far beyond."""
+"""Largest plausible distance of a flange from its base [m]; a wrong unit exceeds it."""
 SAME_POSE = 1e-6
-"""Poses whose entries [m, and of the rotation] differ by less are one pose given twice."""
+"""Poses whose matrix entries differ by less are one pose given twice."""
 
 OF_A_SIMULATOR = "SIMULATED.txt"
-"""A file of this name in an archive says that its recordings are a simulator's."""
+"""Name of a file in an archive which marks its recordings as simulated."""
 
 
 class Reader(Protocol):

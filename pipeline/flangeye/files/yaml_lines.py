@@ -136,7 +136,7 @@ def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> An
     if plain and len(text) > digits and _INTEGER.fullmatch(text):
         raise RecipeError(
             f"{name}:{lines[path]}: an integer of {len(text)} digits; at most {digits} are "
-            "read, and a name of digits is written in quotes"
+            "read; write a name of digits in quotes"
         )
     return _scalar(text, plain)
 

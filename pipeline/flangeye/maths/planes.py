@@ -251,7 +251,8 @@ def _within(off: Floats, halves: Floats) -> Mask:
 
 
 def _counts(chosen: Mask) -> Indices:
-    """Return the number selected in each row; as bytes they add up in half the time."""
+    """Return the number of selected points in each row."""
+    # As bytes they add up in half the time
     return np.asarray(np.add.reduce(chosen.view(np.uint8), axis=1, dtype=np.uint32), dtype=np.intp)
 
 

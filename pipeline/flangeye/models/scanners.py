@@ -27,12 +27,12 @@ class ScannerData(Model):
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
         if self.near is not None and self.far is not None and not 0 <= self.near < self.far:
-            raise ValueError("near, the least distance it sees at, is not below far")
+            raise ValueError("near must be below far")
         return self
 
     @property
     def range(self) -> tuple[float, float]:
-        """Nearest and farthest it sees [m]; any 3D scanner's, where its own is not known."""
+        """Nearest and farthest distance that it measures [m]; if unknown, those of any scanner."""
         # Range in which any 3D scanner of a work cell measures [m]
         near, far = (0.1, 10.0)
         return (near if self.near is None else self.near, far if self.far is None else self.far)

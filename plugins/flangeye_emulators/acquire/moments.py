@@ -89,7 +89,7 @@ class CameraView:
 
 
 Sighting = tuple[int, str, str]
-"""A moment, a camera, a target."""
+"""Index of a sighting's moment, its camera and its target."""
 
 
 def name_of(sighting: Sighting) -> str:

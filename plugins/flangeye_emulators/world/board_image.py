@@ -13,7 +13,7 @@ from flangeye.types import CAMERA, Floats, Image, PointCloud
 PER_SQUARE = 120
 """Pixels of the print along a square; more than any camera resolves of it."""
 RAYS_PER_PIXEL = 2
-"""Rays a pixel along each axis: what it averages over."""
+"""Rays per pixel along each axis, over which its grey value is averaged."""
 GROUND = 90
 """Grey behind the paper."""
 

@@ -22,7 +22,7 @@ from flangeye.models.graph import Topic
 from flangeye_plugins.ros2.messages import Type, stamp_of, types
 
 MATCHING = 0.5
-"""Longest time until what runs is joined to a subscription or a publisher that is new [s]."""
+"""Longest time until discovery connects a new subscription or publisher [s]."""
 
 
 class GraphMessage(NamedTuple):

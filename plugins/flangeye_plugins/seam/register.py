@@ -82,7 +82,7 @@ def register(
     best, seen = found[0].verdict.score, found[0].seen
     if seen < limits.seen:
         raise CalibrationRefused(
-            f"{STAGE}: poor fit: {seen:.0%} of the part's broadest view was seen, at least "
+            f"{STAGE}: poor fit: {seen:.0%} of the part's broadest side is in the scan, at least "
             f"{limits.seen:.0%} is needed; {_look(workpiece)}"
         )
     goes_on = found[0].verdict.goes_on / max(found[0].verdict.agree, 1)

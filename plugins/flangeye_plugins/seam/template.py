@@ -19,7 +19,7 @@ ABSENT = np.nan
 FACES, EDGES = (0, 2), (1, 3)
 """The half-planes: first face, first edge, second face, second edge."""
 OFFSETS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 0.0, -0.5]])
-"""What the two faces' heights and the root gap add to the half-planes' heights."""
+"""Change of each half-plane's height (rows) per unit of first height, second height, root gap."""
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,7 @@ def _misdrawn(
     spans = zip("xyz", corners.min(axis=0), corners.max(axis=0), strict=True)
     box = ", ".join(f"{axis} {low:.0f} to {high:.0f}" for axis, low, high in spans)
     return Rejected(
-        f"{body.name} is there, but not as its mesh has it: a part of it has moved",
+        f"{body.name} is found, but a part of it is not where its mesh has it",
         f"the moved part lies at {box} mm in the mesh's frame",
         "draw the part that moves, such as a gripper's jaws, as it was in the session, or leave it "
         "out of the mesh",

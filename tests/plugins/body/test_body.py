@@ -273,7 +273,7 @@ def test_a_part_that_stands_elsewhere_is_named(further: float) -> None:
     pose = rigid(rotation_from_rpy(2.2, 0.1, -0.9), np.array([0.0, 0.05, 0.8]))
     refused = found(scan(TargetBody("open", moved, GRIPPER.triangles), pose))
     assert isinstance(refused, Rejected)
-    assert "a part of it has moved" in refused.reason
+    assert "a part of it is not where its mesh has it" in refused.reason
     assert "z 106 to 168 mm" in refused.figures
     assert "as it was in the session" in refused.fix
 

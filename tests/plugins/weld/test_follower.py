@@ -270,9 +270,7 @@ def test_a_torch_that_goes_on_has_to_be_on_the_seam_where_it_had_stopped() -> No
     assert doubtful(0.029, None, before=before).phase == "following"
     assert doubtful(0.031, 0.02, off=0.0, before=before).phase == "following"
     told = doubtful(0.031, None, before=before)
-    assert told.reason == (
-        "the torch was not on the seam again where it had stopped; raise 'overlap'"
-    )
+    assert told.reason == ("the torch did not return to the seam before the stop; raise 'overlap'")
 
 
 # --- how hard the tip is to press -----------------------------------------------------------------

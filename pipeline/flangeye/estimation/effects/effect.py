@@ -9,7 +9,7 @@ from flangeye.estimation.graph import Linear, Problem
 from flangeye.types import Floats
 
 Block = Callable[[Problem, Linear], Floats]
-"""Gives (N, 6, K) of sightings, measured or planned: what one unit of each of K numbers does."""
+"""Returns (N, 6, K): derivatives of measured or planned sightings by K parameters."""
 
 
 @dataclass(frozen=True, eq=False)

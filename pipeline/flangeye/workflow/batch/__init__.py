@@ -135,7 +135,7 @@ def _alone(out: str) -> Iterator[None]:
 
 
 def _prepare(job: Job, out: str) -> None:
-    """Make the folder; starts that an earlier batch counted are forgotten."""
+    """Make the folder, and delete the counts of starts that an earlier batch left there."""
     job.place.remove(STARTS)
     try:
         job.place.write(READY, b"")

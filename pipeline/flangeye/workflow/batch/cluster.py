@@ -39,7 +39,7 @@ CONNECT_SECONDS = 5.0
 """Longest wait for a scheduler that was given by address."""
 
 CHUNKS_AHEAD = 3
-"""Chunks that the scheduler is to know of for each worker."""
+"""Number of chunks that are submitted ahead for each worker."""
 
 CHUNK_SECONDS, CHUNK_SESSIONS = 5.0, 500
 """Target duration of a chunk [s], and its largest number of sessions."""

@@ -43,7 +43,7 @@ _HEADINGS: Mapping[str, str] = {
 PALETTE = (
     "#3a7ebf", "#d9822b", "#3f9b57", "#b8485f", "#7d62b5", "#8a6d3b", "#c06fa8", "#5b6474",
 )  # fmt: skip
-"""Distinct on white and on black; a second varied parameter has at most this many values."""
+"""Colours, distinct on white and on black, for the values of a second varied parameter."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def drawings_of(rows: Sequence[Row], varied: Sequence[str]) -> list[tuple[str, D
 
 
 def _axes(rows: Sequence[Row], varied: Sequence[str]) -> tuple[str, str | None]:
-    """Return the columns for a session's position and, if there is a second, its colour."""
+    """Return the varied columns to plot: along the x axis and, if there is a second, by colour."""
     distinct = {name: len({row[name] for row in rows}) for name in (*varied, "archive")}
     varying = sorted((n for n in distinct if distinct[n] > 1), key=lambda n: -distinct[n])
     if not varying:

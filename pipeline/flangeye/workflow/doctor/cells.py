@@ -49,7 +49,7 @@ from flangeye.workflow.run.runner import Runner
 
 Keys = tuple[Hashable, ...]
 Changes = Mapping[Keys, Any]
-"""Other values in a recipe's data, by where they stand."""
+"""Changed values in a recipe's data, by their path of keys."""
 
 Table = Mapping[str, Any]
 """Parameters of one of the tables that ``reader.cell`` reads."""

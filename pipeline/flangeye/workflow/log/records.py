@@ -44,7 +44,7 @@ HASHES = "flangeye.sha256"
 
 
 POINTS_AT_ONCE = 2048
-"""Points turned over at once: they fit the processor's nearest memory."""
+"""Number of points shuffled at once: a block fits the processor's first-level cache."""
 
 POINT_BYTES = 12
 """Bytes of a point."""

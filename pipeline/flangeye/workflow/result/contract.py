@@ -44,7 +44,7 @@ class TransformResult(_Part):
 
     @model_validator(mode="after")
     def _are_of_a_transform(self) -> Self:
-        """Check the sizes, which JSON leaves open."""
+        """Check the arrays' sizes, which JSON Schema does not state."""
         sizes = {"matrix": (self.matrix, 4), "covariance": (self.covariance, 6)}
         sizes |= {f"shares.{cause}": (share, 6) for cause, share in self.shares.items()}
         for name, (rows, count) in sizes.items():
@@ -106,7 +106,7 @@ class ObservationResult(_Part):
 
     @model_validator(mode="after")
     def _are_of_space(self) -> Self:
-        """Check the sizes, which JSON leaves open."""
+        """Check the arrays' sizes, which JSON Schema does not state."""
         points = (
             self.centre_in_camera, self.normal_in_camera, self.tcp_in_base, self.residual_in_base,
             *(self.covariance or []),
@@ -184,7 +184,7 @@ class TruthResult(_Part):
     """For an arm with errors: rms distance, at poses not used, between the target's position by the
     camera and by the controller [m]. The correction of the circle's place is applied, if any."""
     at_work_corrected: float | None = None
-    """The same for the corrected arm and the pose for it [m]."""
+    """The same for the corrected arm and its pose of the camera [m]."""
 
 
 class SeamTruthResult(_Part):
@@ -345,7 +345,7 @@ class Result(_Part):
     correction: CorrectionResult | None = None
     """Where on the flange the circle is, if not at its origin."""
     answers: AnswersResult | None = None
-    """The transforms for the arm as it reports, and those for it corrected."""
+    """The transforms for the arm as its controller reports it, and for the corrected arm."""
     expected_error: ExpectedErrorResult | None = None
     """The error to expect at the work, with the transforms for the arm as its controller reports
     it; null where the solver does not estimate it."""

@@ -102,7 +102,7 @@ class AuboClient:
                 2: "its queue is full",
                 3: "it is busy",
                 4: "it took too long",
-                5: "a number is not acceptable",
+                5: "an argument is invalid",
                 8: "this account may not do it",
             }.get(abs(code), f"return value {code}")
             raise DeviceError(f"{self._name}: {what}: not done: {why}")

@@ -27,7 +27,7 @@ LEAD_TIME = 0.1
 
 STOPPING = 0.2
 """Longest time in which a piece comes to rest after that [s]. With :data:`LEAD_TIME`, and a tenth
-of a second for the controller, an arm that nobody leads any more stands within half a second."""
+of a second for the controller, an arm without further commands is at rest within half a second."""
 
 BEHIND = 0.2
 """Time before now at which a piece's points begin [s]: more than clock error and message delay."""

@@ -237,7 +237,7 @@ class Welding:
             return self.too_uncertain(bound)
         if task.before is not None:
             late = torch > task.before.torch
-            again = "the torch was not on the seam again where it had stopped; raise 'overlap'"
+            again = "the torch did not return to the seam before the stop; raise 'overlap'"
             return again if late else ""
         if torch - self.begins <= LEFT_OUT * (self.ends - self.begins):
             return ""

@@ -478,7 +478,8 @@ def _neither(arm: PoseColumns, robot: RobotModel | None) -> str:
     named = f" nor as joint angles of {robot.model}" if robot else f"; joint angles? {NAME_THE_ARM}"
     return (
         f"{arm.table.file}: {len(arm.columns)} numbers a row; in no usual convention of "
-        f"poses do they turn as the target does{named}; or say --rotation (kuka, vector, …)"
+        f"poses does their rotation agree with the target's{named}; or say --rotation (kuka, "
+        "vector, …)"
     )
 
 
