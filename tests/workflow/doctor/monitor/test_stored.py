@@ -1,0 +1,124 @@
+"""What a stored calibration expects of later sightings, by numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flangeye import types as t
+from flangeye.estimation.watch.drift import CheckSightings
+from flangeye.maths.kinematics import Arm
+from flangeye.maths.statistics import corners_of
+from flangeye.models.loading import load_model
+from flangeye.types.geometry import rotation_exp
+from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
+from tests.workflow.doctor.monitor.cell import WORKSPACE, calibrate
+
+ARM = Arm(load_model("robots", "ur5e"))
+JOINTS = np.radians([10.0, -125.0, -105.0, -40.0, -90.0, 170.0])
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> StoredCalibration:
+    recipe = "robot: {model: ur5e}"
+    return stored_calibration(calibrate(tmp_path_factory.mktemp("stored") / "run", recipe))
+
+
+def where_it_should_be(stored: StoredCalibration, count: int = 3) -> list[t.Observation]:
+    """Return sightings of a flange exactly where the calibration and the arm have it."""
+    seen = []
+    for number in range(count):
+        joints = JOINTS + 0.1 * number
+        flange = t.Transform(t.BASE, t.FLANGE, ARM.flange(joints))
+        found = stored.estimate.transform.inverse() @ flange
+        circle = t.CircleFeature(
+            found.translation, found.rotation[:, 2], {}, 1e-8 * np.eye(3), 1e-6 * np.eye(3), 1.0
+        )
+        seen.append(t.Observation(f"scan-{number}", circle, t.by_frame(flange), joints))
+    return seen
+
+
+def sightings(stored: StoredCalibration, seen: list[t.Observation]) -> CheckSightings:
+    return stored.sightings(seen, np.zeros(len(seen), dtype=np.intp))
+
+
+def changed(seen: t.Observation, **feature: Any) -> t.Observation:
+    return replace(seen, feature=replace(seen.circle, **feature))
+
+
+def test_what_is_where_it_should_be_has_no_residual(stored: StoredCalibration) -> None:
+    told = sightings(stored, where_it_should_be(stored))
+    np.testing.assert_allclose(told.residuals, 0.0, atol=1e-9)
+    assert told.check.tolist() == [0, 0, 0]
+
+
+def test_a_shift_shows_in_the_base_and_a_tilt_across_the_flange_s_axis(
+    stored: StoredCalibration,
+) -> None:
+    first, second, third = where_it_should_be(stored)
+    aside = changed(first, centre=first.circle.centre + [1e-3, 0.0, 0.0])
+    assert second.circle.normal is not None
+    axis = stored.estimate.transform.inverse().rotation @ second.base_T_flange.rotation[:, 0]
+    tilted = changed(second, normal=rotation_exp(0.01 * axis) @ second.circle.normal)
+    bare = changed(third, normal=None, normal_covariance=None)
+    told = sightings(stored, [aside, tilted, bare])
+    shift = stored.estimate.transform.rotation @ [1e-3, 0.0, 0.0]
+    np.testing.assert_allclose(told.residuals[0], [*shift, 0.0, 0.0], atol=1e-9)
+    # About its x the axis of a flange leans towards its -y
+    np.testing.assert_allclose(told.residuals[1], [0.0, 0.0, 0.0, 0.0, -0.01], atol=1e-6)
+    # Without a normal there is no tilt, and nothing is known of it
+    np.testing.assert_allclose(told.residuals[2], 0.0, atol=1e-9)
+    assert (np.diagonal(told.covariances[2])[3:] > 1e3 * np.diagonal(told.covariances[1])[3:]).all()
+
+
+def test_the_joints_move_the_circle_as_the_arm_does(stored: StoredCalibration) -> None:
+    seen = where_it_should_be(stored)
+    told = sightings(stored, seen)
+    assert told.joints is not None
+    at = ARM.flange(JOINTS)[:3, 3]
+    for joint in range(6):
+        by = ARM.flange(JOINTS + 1e-6 * np.eye(6)[joint])[:3, 3] - at
+        # By its sign: the circle's residual is what is seen less what the arm says
+        np.testing.assert_allclose(np.abs(told.joints[0][:3, joint]), np.abs(by) / 1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("lost", ["joints", "arm"])
+def test_where_arm_or_angles_are_not_known_the_joints_tell_nothing(
+    stored: StoredCalibration, lost: str
+) -> None:
+    seen = where_it_should_be(stored)
+    if lost == "joints":
+        seen[1] = replace(seen[1], joints=None)
+        assert sightings(stored, seen).joints is None
+    else:
+        unknown = replace(stored, log=replace(stored.log, attachments={}))
+        assert unknown.arm is None and sightings(unknown, seen).joints is None
+
+
+def test_the_work_is_watched_at_its_corners(stored: StoredCalibration) -> None:
+    about = stored.estimate.about
+    corners = corners_of(WORKSPACE.centre, WORKSPACE.size)
+    np.testing.assert_allclose(stored.corners + about, corners, atol=1e-12)
+    # Where no work is known, all that the calibration saw is; and where that is nothing, a point
+    unknown = replace(stored, log=replace(stored.log, source=None))
+    places = np.array([pair.observation.tcp_in_base for pair in stored.calibration.pairs])
+    around = unknown.corners + about
+    np.testing.assert_allclose(around.min(axis=0), places.min(axis=0), atol=1e-12)
+    np.testing.assert_allclose(around.max(axis=0), places.max(axis=0), atol=1e-12)
+    nothing = replace(unknown, calibration=replace(stored.calibration, pairs=()))
+    assert nothing.corners.tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_the_key_tells_calibrations_apart_by_a_nanometre(stored: StoredCalibration) -> None:
+    def moved(by: float) -> str:
+        camera = stored.calibration.camera
+        pose = camera.transform.matrix.copy()
+        pose[0, 3] += by
+        there = replace(camera, transform=t.Transform(t.BASE, t.CAMERA, pose))
+        return replace(stored, calibration=replace(stored.calibration, camera=there)).key
+
+    assert moved(0.0) == stored.key != moved(2e-9)
+    assert "\n" not in stored.key
