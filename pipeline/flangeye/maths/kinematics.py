@@ -172,7 +172,7 @@ class Arm:
         frames = np.empty((*joints.shape[:-1], self.n + 1, 4, 4))
         frames[..., 0, :, :] = np.eye(4)
         for i in range(self.n):
-            frames[..., i + 1, :, :] = frames[..., i, :, :] @ steps[..., i, :, :]
+            np.matmul(frames[..., i, :, :], steps[..., i, :, :], out=frames[..., i + 1, :, :])
         return frames
 
     def flange(self, joints: Floats) -> Floats:

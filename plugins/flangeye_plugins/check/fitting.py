@@ -176,7 +176,11 @@ def _block(residuals: Floats, parts: Sequence[Floats], dimension: int, finest: f
 
 
 def _first_scale(block: ErrorBlock) -> Floats:
-    middle = np.nanmedian(block.squares, axis=-1)
+    # A median without NaN, as np.nanmedian finds it in eight times the time: NaN are sorted last
+    rising = np.sort(block.squares, axis=-1)
+    count = (~np.isnan(rising)).sum(axis=-1, keepdims=True)
+    ends = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=-1)
+    middle = np.take_along_axis(rising, ends, -1).mean(axis=-1)
     return np.asarray(np.sqrt(np.maximum(middle / block.dimension, block.finest**2)))
 
 
