@@ -107,7 +107,8 @@ def _guided(
             rest = readings(robot).take(40)
             ask("Set the tip into a punch mark or a cone, so that it cannot slide; then keep clear")
         with arm.moving() as robot:
-            held = list(readings(robot).held())
+            # Where nothing is seen at rest, nothing is gained by moving the arm
+            held = list(readings(robot).held()) if rest else []
             found = calibrate(rest, held, f"flangeye tactile calibrate, on {robot.name}")
         pivoted = None
         if body:
