@@ -48,13 +48,14 @@ def test_the_covariance_is_that_of_drawn_calibrations() -> None:
     at = np.array([[0.56, y, 0.08] for y in (-0.1, 0.0, 0.1)])
     stated = seen_in_base("seam.joint", scan, known, None).covariance(at)
     rng, about = np.random.default_rng(1), np.asarray(known.camera.about)
-    moved = []
-    for _ in range(4000):
-        turn = rotation_exp(sigma[0] * rng.standard_normal(3))
-        motion = rigid(turn, about - turn @ about + sigma[1] * rng.standard_normal(3))
-        off = [p.base_T_flange @ motion @ np.linalg.inv(p.base_T_flange) for p in scan.places]
-        moved.append([(m[:3, :3] @ at.T).T + m[:3, 3] - at for m in off])
-    each = np.array(moved)
+    n = 4000
+    turns = rotation_exp(sigma[0] * rng.standard_normal((n, 3)))
+    motions = np.tile(np.eye(4), (n, 1, 1))
+    motions[:, :3, :3] = turns
+    motions[:, :3, 3] = about - turns @ about + sigma[1] * rng.standard_normal((n, 3))
+    stands = np.array([place.base_T_flange for place in scan.places])
+    off = stands @ motions[:, None] @ np.linalg.inv(stands)
+    each = at @ off[..., :3, :3].swapaxes(-1, -2) + off[..., None, :3, 3] - at
     drawn = np.cov(each.mean(axis=1)[:, 1].T)  # amid both, whose shares are equal there
     assert np.sqrt(np.diag(stated[1])) == pytest.approx(np.sqrt(np.diag(drawn)), rel=0.1)
 
