@@ -199,7 +199,7 @@ def bent(tmp_path: FilePath) -> FilePath:
     return tmp_path / "bent.yaml"
 
 
-@pytest.mark.parametrize("leg", [1, 2])
+@pytest.mark.parametrize("leg", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: int) -> None:
     line = np.array(BENT) * 1e-3 @ cell.HERE[:3, :3].T + cell.HERE[:3, 3]
     off = np.array([1e-3, -0.7e-3, 0.0])

@@ -85,7 +85,7 @@ def test_a_weld_writes_the_file_and_the_next_one_starts_from_it(tmp_path) -> Non
     path = tmp_path / "prior.yaml"
     path.write_bytes(kept)
     seam = planned("v-straight", end=0.04)
-    _, journal = run(seam, prior=path, sensor={"hidden": ("6 s", "60 s")})
+    _, journal = run(seam, prior=path, sensor={"hidden": ("1 s", "60 s")})
     prior = dict(journal[:1])["start"]["prior"]
     assert prior["ahead_sigma"] < BELIEF.tip_sigma
 

@@ -80,7 +80,7 @@ def test_the_arc_burns_where_the_bound_holds_and_nowhere_else(
 
 
 def test_an_arc_that_goes_out_stops_the_weld(monkeypatch: pytest.MonkeyPatch) -> None:
-    report, _, source = welded(monkeypatch, fails_after=150)
+    report, _, source = welded(monkeypatch, fails_after=150, speed="10 mm/s")
     assert not report.completed and not source.burning()
     assert report.reason.startswith("simulated power source: the arc does not burn; ")
     assert "of the seam was welded, from 0 to " in report.reason

@@ -174,7 +174,7 @@ def test_the_torch_keeps_to_a_seam_that_bends_out_of_every_plane(
 
     monkeypatch.setattr(SimulatedFinger, "frame", watched)
     report, _ = cell.run(
-        planned, str(tmp_path / "part.yaml"), speed="10 mm/s", ends="3 mm", overlap="20 mm",
+        planned, str(tmp_path / "part.yaml"), speed="15 mm/s", ends="3 mm", overlap="20 mm",
         limits={"joint_speed": "90 deg/s"},
     )  # fmt: skip
     assert report.completed, report.reason

@@ -14,7 +14,7 @@ from flangeye.types import Seam
 from flangeye_emulators.weld_world.groove import Gap
 from flangeye_emulators.weld_world.truth import ClockTruth, WeldTruth, WorkpieceTruth
 from flangeye_plugins.weld.settings import WeldTactileParams
-from tests.plugins.weld.cell import planned, planning_error, run, true_line
+from tests.plugins.weld.cell import planned, planning_error, run, true_line, welded
 
 SHORT = 0.06
 
@@ -26,7 +26,7 @@ def deviation(report, name, start=0.0):
 
 
 def test_the_torch_stays_in_the_seam() -> None:
-    report, journal = run(planning_error("v-straight", seed=4, end=SHORT), seed=4)
+    report, journal = welded()
     assert report.completed
     errors = deviation(report, "v-straight")
     assert np.sqrt(np.mean(errors**2)) < 0.15e-3
@@ -198,7 +198,7 @@ def test_a_mode_that_no_plugin_offers_is_named_with_those_that_are_there() -> No
 
 
 def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed() -> None:
-    report, _ = run(planned("v-straight", end=SHORT), sensor={"world": "torch_aside"})
+    report, _ = run(planned("v-straight", end=0.04), sensor={"world": "torch_aside"})
     assert report.completed
     believed = torch_deviation(report.torch, true_line("v-straight"), report.opening)
     true = torch_deviation(report.true_torch, true_line("v-straight"), report.opening)
