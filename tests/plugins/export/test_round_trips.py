@@ -27,13 +27,29 @@ from rosbags.typesys import Stores, get_typestore
 from flangeye import StageError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
+from flangeye.models.robots import RobotModel
 from flangeye.testing import ExportConformance
-from flangeye.types import BASE, CAMERA, FLANGE, ArmCorrection, CalibratedPose, Transform
+from flangeye.types import (
+    BASE,
+    CAMERA,
+    FLANGE,
+    ArmCorrection,
+    CalibratedPose,
+    HandEye,
+    Transform,
+    TransformEstimate,
+)
 from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.export import EXPORTS
-from flangeye_plugins.export.controllers import with_correction
+from flangeye_plugins.export.controllers import export_robot, with_correction
 from flangeye_plugins.export.documents import UrdfParams
-from flangeye_plugins.export.writing import LengthParams, NumberedParams, fixed, rounded
+from flangeye_plugins.export.writing import (
+    LengthParams,
+    NamedParams,
+    NumberedParams,
+    fixed,
+    rounded,
+)
 
 with warnings.catch_warnings():  # robodk warns of its own __init__
     warnings.simplefilter("ignore", PendingDeprecationWarning)
@@ -543,6 +559,33 @@ def test_an_arm_with_other_zeros_stands_as_it_reports_less_these(lengths: bool) 
     corrected, joints = Arm(with_correction(robot, correction)), np.array([0.1, -1, 1, -1, -1, 0.3])
     arm = Arm(robot) if longer is None else Arm(robot).perturbed(longer)
     np.testing.assert_allclose(corrected.flange(joints), arm.flange(joints + zeros), atol=1e-12)
+
+
+@pytest.mark.parametrize("lengths", [None, 1e-3 * np.arange(18.0).reshape(6, 3)])
+def test_a_corrected_arm_is_a_robot_file_of_lines_that_are_read_again(lengths: Any) -> None:
+    robot, zeros = load_model("robots", "ur5e"), 0.01 * np.arange(1.0, 7.0)
+    correction = ArmCorrection(np.zeros(3), joint_offsets=zeros, lengths=lengths)
+    file = export_robot.function(
+        CalibratedPose(BENIGN, REMARKS), calibrated(correction), robot, NamedParams(name="mine")
+    )
+    assert file.name == "mine.yaml" and max(map(len, file.text.splitlines())) <= 200
+    assert all(f"# {remark}" in file.text for remark in REMARKS)
+    read = RobotModel.model_validate(yaml.safe_load(file.text))
+    assert read == with_correction(robot, correction)
+
+
+@pytest.mark.parametrize("correction", [None, ArmCorrection(np.zeros(3))])
+def test_an_arm_whose_joints_were_not_corrected_is_no_robot_file(correction: Any) -> None:
+    robot = load_model("robots", "ur5e")
+    with pytest.raises(StageError, match=r"export\.robot: no error of the arm's joints was found"):
+        export_robot.function(CalibratedPose(BENIGN), calibrated(correction), robot, NamedParams())
+
+
+def calibrated(correction: ArmCorrection | None) -> HandEye:
+    """Return a calibration that found this wrong with its arm."""
+    return HandEye(
+        TransformEstimate(BENIGN, 1e-8 * np.eye(6), np.zeros(3)), (), "solve", (), correction
+    )
 
 
 def test_each_format_is_explained_in_the_docs() -> None:
