@@ -22,7 +22,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from flangeye.cli import commands
-from flangeye.cli.console import end_in_words
+from flangeye.cli.console import report_errors
 from flangeye.types.geometry import rigid
 from tests.estimation import foreign
 
@@ -314,7 +314,7 @@ def _flangeye(*words: object) -> Said:
     """Run a command in this process, which saves importing the modules each time."""
     said, why = io.StringIO(), io.StringIO()
     with redirect_stdout(said), redirect_stderr(why), suppress(SystemExit):
-        end_in_words(lambda: commands()(list(map(str, words))))
+        report_errors(lambda: commands()(list(map(str, words))))
     return Said(said.getvalue(), why.getvalue())
 
 

@@ -13,7 +13,7 @@ from flangeye_emulators.weld_world.truth import (
     ClockTruth,
     FingerTruth,
     HeatTruth,
-    LookTruth,
+    ProfilerTruth,
     Tack,
     ToolTruth,
     WeldTruth,
@@ -40,7 +40,7 @@ class Condition(NamedTuple):
     prior: Mapping[str, Any] = {}
     half_angle: float | None = None
     section: GrooveSection | None = None
-    look: LookTruth | None = None
+    look: ProfilerTruth | None = None
 
 
 FILLET = GrooveSection(np.pi / 4, 30e-3, -np.pi / 4)
@@ -79,18 +79,18 @@ CONDITIONS: Mapping[str, Condition] = {
     ),
     "heat: seam moves 2 mm, with a look behind": Condition(
         WeldTruth(heat=HeatTruth(shift=2e-3)), {"distortion": "0.3 mm", "max_error": "2 mm"},
-        look=LookTruth(),
+        look=ProfilerTruth(),
     ),
     "heat: 1 mm around the torch": Condition(
         WeldTruth(heat=HeatTruth(local=1e-3)), {"distortion": "0.5 mm", "max_error": "2.5 mm"}
     ),
     "heat: 1 mm around the torch, with a look behind": Condition(
         WeldTruth(heat=HeatTruth(local=1e-3)), {"distortion": "0.5 mm", "max_error": "3.5 mm"},
-        look=LookTruth(),
+        look=ProfilerTruth(),
     ),
     "torch 0.2 mm aside": Condition(WeldTruth(tool=ToolTruth(torch=(0.0, 0.2e-3)))),
     "torch 0.2 mm aside, with a look behind": Condition(
-        WeldTruth(tool=ToolTruth(torch=(0.0, 0.2e-3))), look=LookTruth()
+        WeldTruth(tool=ToolTruth(torch=(0.0, 0.2e-3))), look=ProfilerTruth()
     ),
     "seam wavy 1 mm per 10 mm": Condition(
         WeldTruth(workpiece=WorkpieceTruth(wave=1e-3)), {"max_error": "1.5 mm"}

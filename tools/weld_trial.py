@@ -10,8 +10,8 @@ import numpy as np
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
 from flangeye_emulators.finger.profiler import LookBehind
-from flangeye_emulators.weld_world.truth import LookTruth, WeldTruth
-from flangeye_emulators.weld_world.world import ArmResponse, Nominal, Shutter, WeldWorld
+from flangeye_emulators.weld_world.truth import ProfilerTruth, WeldTruth
+from flangeye_emulators.weld_world.world import ArmResponse, ImageQueue, Nominal, WeldWorld
 from flangeye_plugins.weld.following.follower import Follower
 
 
@@ -113,7 +113,7 @@ class Start:
     angle: float = 0.0
     period: float = 8e-3
     longest: float = 240.0
-    look: LookTruth | None = None
+    look: ProfilerTruth | None = None
 
 
 def run_trial(
@@ -122,7 +122,7 @@ def run_trial(
     """Run a controller in a simulated world, and record the true torch."""
     world = WeldWorld(nominal, truth, [seed, 0])
     rng = np.random.default_rng([seed, 1])
-    shutter: Shutter[Floats] = Shutter(truth.clock, rng)
+    shutter: ImageQueue[Floats] = ImageQueue(truth.clock, rng)
     pose = ToolPose(1.0, np.asarray(start.position, dtype=np.float64), start.angle)
     arm = ArmResponse(truth.arm, pose, start.period)
     noise = truth.finger.noise * np.array([1.0, 1.0, 6.0])

@@ -18,10 +18,10 @@ from flangeye.workflow.report.units import millimetres
 from flangeye.workflow.result import status_of
 from flangeye.workflow.result.contract import Result
 from flangeye_ui.charts import bar_chart
-from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView
+from flangeye_ui.served_files import address_of
 
 
 def add(project: Project) -> None:

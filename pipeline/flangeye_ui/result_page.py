@@ -30,10 +30,10 @@ from flangeye.workflow.report.weld import weld_drawing
 from flangeye.workflow.result.sections import expected_error
 from flangeye.workflow.run.outlook import Outlook, outlook_of_log
 from flangeye_ui.charts import coverage_drawing, residual_chart
-from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page, svg, warning
 from flangeye_ui.project import Project
 from flangeye_ui.scene import ScanView, Scene3D, outline_of
+from flangeye_ui.served_files import address_of
 
 TOUCH_FIELDS = {
     "seen": ("A point in the camera, from a scan", "12 mm, -40 mm, 702 mm"),

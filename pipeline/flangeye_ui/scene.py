@@ -384,7 +384,7 @@ class ScanView:
         """Show a scan: its flange, the fitted rim, and its outcome."""
         if self.log is None:
             return
-        self.say(f"capture {capture}: {fate_of(self.log, capture)}")
+        self.say(f"capture {capture}: {outcome_text(self.log, capture)}")
         self._scene.wipe()
         for entry in self.log.of_kind("segment"):
             if entry.capture == capture and isinstance(entry.value, t.FlangeCloud):
@@ -400,7 +400,7 @@ class ScanView:
         self._scene.move_camera(x, y, z, to_x, to_y, to_z, 0.0, -1.0, 0.0, 0.0)
 
 
-def fate_of(log: RunLog, capture: str) -> str:
+def outcome_text(log: RunLog, capture: str) -> str:
     """Return the outcome of a capture in words."""
     for rejection in log.rejections:
         if rejection.id == capture:

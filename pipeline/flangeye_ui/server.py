@@ -31,11 +31,11 @@ from flangeye.plugin.registry import Registry
 from flangeye_ui import (
     archive_page,
     cell_page,
-    foreign,
     poses_page,
     result_page,
     scan_page,
     scene,
+    served_files,
     use_page,
     watch_page,
 )
@@ -81,13 +81,13 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
         cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, scene,
     ):  # fmt: skip
         each.add(project)
-    foreign.add(project.folder)
+    served_files.add(project.folder)
     app.add_middleware(Gate, keys=keys, host=host, port=port)
     app.on_shutdown(lambda: project.run.stop("the page's server ended") if project.run else None)
     say(f"open {at}{keys.token}")
     app.config.socket_io_js_transports = ["websocket"]
     logging.getLogger("nicegui").addFilter(in_words)
-    file = way_in(folder, at + keys.token)
+    file = redirect_file(folder, at + keys.token)
     app.on_shutdown(lambda: file.unlink(missing_ok=True))  # also where the server is terminated
     if browser:
         app.on_startup(lambda: threading.Thread(target=show, args=(file,), daemon=True).start())
@@ -112,7 +112,7 @@ def in_words(record: logging.LogRecord) -> bool:
     return True
 
 
-def way_in(folder: Path, address: str) -> Path:
+def redirect_file(folder: Path, address: str) -> Path:
     """Write a file that redirects to an address which other users must not see.
 
     Command lines are readable by everybody, so the browser is started with a file that only its

@@ -19,10 +19,10 @@ from flangeye.workflow.report.certificate.budget import Conditions
 from flangeye.workflow.report.facts import Facts
 from flangeye.workflow.result import calibrated_pose
 from flangeye.workflow.result import contract as r
-from flangeye_ui.foreign import address_of
 from flangeye_ui.layout import ActionBar, code, command_line, mistake, page
 from flangeye_ui.project import Project
 from flangeye_ui.result_page import chosen_run
+from flangeye_ui.served_files import address_of
 
 CERTIFICATE_FIELDS = {
     "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from flangeye.files.paths import place_at
+from flangeye.files.paths import storage_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.workflow import batch
 from flangeye.workflow.batch import Request
@@ -37,7 +37,7 @@ def size(folder: Path) -> int:
 def write_rows(request: Request, registry: Registry) -> None:
     """Write the rows of all sessions, five hundred at a time as workers do."""
     columns = columns_of({})
-    dataset = Dataset(place_at(str(request.out)), columns)
+    dataset = Dataset(storage_at(str(request.out)), columns)
     sessions = enumerate(plan(request, registry, software_of(registry)))
     while some := list(islice(sessions, 500)):
         rows = [

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from flangeye.cli import commands
 from flangeye.cli.app import GROUPS
-from flangeye.cli.console import end_in_words, wrapped, write
+from flangeye.cli.console import report_errors, wrapped, write
 from flangeye.cli.details import print_details
 from flangeye.cli.summary import RunProgress, print_refusal, print_summary
 from flangeye.errors import RecipeError
@@ -180,7 +180,7 @@ def test_what_is_said_is_bounded(
         raise error
 
     with pytest.raises(SystemExit, match="2"):
-        end_in_words(fails)
+        report_errors(fails)
     assert capsys.readouterr().err.splitlines() == said
 
 
@@ -192,7 +192,7 @@ def test_a_library_that_does_not_load_is_a_lack_of_memory_where_there_is_none(
         raise error
 
     with pytest.raises(type(error)):
-        end_in_words(fails)
+        report_errors(fails)
 
     def runs_out() -> None:
         monkeypatch.setattr("flangeye.files.processes.mmap.mmap", no_map)
@@ -202,7 +202,7 @@ def test_a_library_that_does_not_load_is_a_lack_of_memory_where_there_is_none(
         raise OSError
 
     with pytest.raises(SystemExit, match="2"):
-        end_in_words(runs_out)
+        report_errors(runs_out)
     assert capsys.readouterr().err.splitlines() == [
         f"error: not enough memory: {type(error).__name__}: {error}; fewer than 256 MB are left"
     ]

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.paths import place_at
+from flangeye.files.paths import storage_at
 
 
 @pytest.mark.parametrize("elsewhere", [False, True], ids=["here", "elsewhere"])
@@ -15,7 +15,7 @@ def test_files_are_written_whole_read_listed_and_removed(
 ) -> None:
     if elsewhere:
         request.getfixturevalue("bucket")
-    place = place_at("s3://cell/monday/" if elsewhere else str(tmp_path))
+    place = storage_at("s3://cell/monday/" if elsewhere else str(tmp_path))
     assert place.read("a/b") is None and place.names("a") == []
     place.write("a/b", b"1")
     place.write("a/b", b"2")
@@ -34,11 +34,11 @@ def test_files_are_written_whole_read_listed_and_removed(
 def test_what_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StageError) as caught:
-        place_at(str(tmp_path)).write("file/b/a", b"")
+        storage_at(str(tmp_path)).write("file/b/a", b"")
     assert str(caught.value) == f"{tmp_path}/file/b/a: cannot be written: Not a directory"
     (tmp_path / "folder").mkdir()
     with pytest.raises(StageError, match="folder: cannot be written: Is a directory"):
-        place_at(str(tmp_path)).write("folder", b"")
+        storage_at(str(tmp_path)).write("folder", b"")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 
 
@@ -46,6 +46,6 @@ def test_a_store_that_cannot_be_reached_is_one_line(
     monkeypatch: pytest.MonkeyPatch, bucket: Any
 ) -> None:
     with pytest.raises(StageError, match=r"^s3://nobody-s/a: cannot be reached: .*$"):
-        place_at("s3://nobody-s").write("a", b"")
+        storage_at("s3://nobody-s").write("a", b"")
     with pytest.raises(StageError, match=r"ftp:// is not known; s3://, "):
-        place_at("ftp://host/a")
+        storage_at("ftp://host/a")

@@ -472,12 +472,12 @@ def _read_named(path):
 
 
 def _read_url(path):
-    from flangeye.files.elsewhere import is_url, print_of, results_at, system_of
+    from flangeye.files.remote import is_url, remote_fingerprint, results_at, system_of
 
     url = path.read_bytes().decode("utf-8", "replace")
     if is_url(url):
         system_of(url)
-        print_of(url)
+        remote_fingerprint(url)
     else:
         with results_at(url):
             pass
@@ -558,14 +558,14 @@ def _batch_columns():
 
 
 def _read_batch(path):
-    from flangeye.files.paths import place_at
+    from flangeye.files.paths import storage_at
     from flangeye.workflow.batch.dataset import FOLDER, Dataset
 
     folder = path.with_suffix("")
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)
     (folder / FOLDER / "000000-a.parquet").write_bytes(path.read_bytes())
     schema = _batch_columns()
-    dataset = Dataset(place_at(str(folder)), dict(zip(schema.names, schema.types, strict=True)))
+    dataset = Dataset(storage_at(str(folder)), dict(zip(schema.names, schema.types, strict=True)))
     dataset._read(f"{FOLDER}/000000-a.parquet").to_pylist()
 
 

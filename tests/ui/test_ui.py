@@ -617,7 +617,7 @@ def test_a_browser_is_started_without_the_token_in_its_command_line(
     address = "http://127.0.0.1:8090/?token=secret"
     asked: list[str] = []
     monkeypatch.setattr("flangeye_ui.server.webbrowser.open", asked.append)  # and finds none
-    file = server.way_in(tmp_path, address)
+    file = server.redirect_file(tmp_path, address)
     server.show(file)
     assert address in file.read_text()
     assert file.stat().st_mode & 0o077 == 0

@@ -9,7 +9,7 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from flangeye.cli.console import end_in_words
+from flangeye.cli.console import report_errors
 
 if TYPE_CHECKING:
     from typer import Typer
@@ -21,7 +21,7 @@ def main() -> None:
     # wait for each other, which costs a run twice its seconds. Read when numpy is imported
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    end_in_words(lambda: commands()())
+    report_errors(lambda: commands()())
 
 
 def commands() -> Typer:

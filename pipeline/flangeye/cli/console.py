@@ -60,7 +60,7 @@ def say_notes(notes: Sequence[str]) -> None:
 
 
 @contextmanager
-def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
+def progress_bar(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]:
     """Show a progress bar on a terminal, with the time left if the number of steps is known.
 
     Yields a function to call after each step. A call after the last step starts a new round.
@@ -85,7 +85,7 @@ def at_work(what: str, steps: int | None = None) -> Iterator[Callable[[], None]]
         yield step
 
 
-def end_in_words(command: Callable[[], object]) -> None:
+def report_errors(command: Callable[[], object]) -> None:
     """Run the command line; an expected error is printed as one line and gives an exit code."""
     keep_current_folder_out()
     # Ours are not plugins of pydantic; it would look for one in every installed distribution.
@@ -153,14 +153,14 @@ def _fail(error: FlangeyeError) -> NoReturn:
     sys.exit(error.exit_code)
 
 
-def name_damage(log: RunLog) -> None:
+def require_undamaged(log: RunLog) -> None:
     """Name every damaged part, and end as for bad input."""
     say_notes(log.notes)
     log.require_sound()
 
 
 @contextmanager
-def of_foreign(path: Path, what: str) -> Iterator[None]:
+def as_damage(path: Path, what: str) -> Iterator[None]:
     """Report any failure in the context as damage of a log from an unknown source."""
     from flangeye.workflow.log.records import reason_of
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flangeye.cli.app import app, ask, load_plugins
-from flangeye.cli.console import at_work, say
+from flangeye.cli.console import progress_bar, say
 from flangeye.errors import FlangeyeError, NothingSeen, RecipeError
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def _seen(
     try:
         # Its paths start at the recipe's folder.
         recipe = parse_recipe(draft.text, out.name, registry, [f"steps.0.path={folder}"])
-        with at_work("looking for the target"):
+        with progress_bar("looking for the target"):
             return Runner(recipe, registry, ArchivePath(folder)).take(count)
     except NothingSeen as error:
         if needed:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
-from flangeye.cli.console import at_work, name_damage, of_foreign, say, say_notes
+from flangeye.cli.console import as_damage, progress_bar, require_undamaged, say, say_notes
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def show(
     from flangeye.cli.details import print_log
 
     print_log(Console(), read)
-    name_damage(read)
+    require_undamaged(read)
 
 
 def _print_outlook(read: RunLog) -> None:
@@ -62,7 +62,7 @@ def _print_outlook(read: RunLog) -> None:
 
     read.require_gathered()
     registry = load_plugins()
-    with at_work("assessing the poses"), of_foreign(read.path, "it cannot be judged"):
+    with progress_bar("assessing the poses"), as_damage(read.path, "it cannot be judged"):
         found = outlook_of_log(read, registry)
     for line in found.lines():
         say(line)
@@ -73,7 +73,7 @@ def _replay(log: Path) -> None:
     from flangeye.workflow.run.replay import replay_steps
 
     same = True
-    with at_work("repeating"), of_foreign(log, "its decisions cannot be repeated"):
+    with progress_bar("repeating"), as_damage(log, "its decisions cannot be repeated"):
         redone_steps = list(replay_steps(log, load_plugins()))
     for step, redone in redone_steps:
         say(f"{step}: {redone.what}: {'the same' if redone.same else 'NOT the same'}")
@@ -98,10 +98,10 @@ def report(
     read = read_run(log)
     path = out or read.path.parent / "report.html"
     read.require_gathered()
-    with at_work("report"), of_foreign(read.path, "no report can be made of it"):
+    with progress_bar("report"), as_damage(read.path, "no report can be made of it"):
         write_report(read, path)
     say(path)
-    name_damage(read)
+    require_undamaged(read)
 
 
 @app.command()
@@ -133,7 +133,7 @@ def certificate(  # noqa: PLR0913  one argument an option
     from flangeye.workflow.report.certificate.budget import Conditions
 
     conditions = Conditions(temperature, spread, place, operator)
-    with at_work("certificate"):
+    with progress_bar("certificate"):
         page = write_certificate(run, out, conditions, camera)
         printed = print_pdf(page) if pdf else None
     for path in filter(None, (page, printed)):
@@ -218,8 +218,8 @@ def doctor(
     if checked is not None and recipe == str(archive):
         archive = _archive_of(checked)
     with (
-        of_foreign(archive, "it cannot be examined"),
-        at_work("looking for mistakes", len(registry.of_kind("check"))) as step,
+        as_damage(archive, "it cannot be examined"),
+        progress_bar("looking for mistakes", len(registry.of_kind("check"))) as step,
     ):
         diagnosis = examined(archive, registry, checked, step)
     say_notes(diagnosis.damage)

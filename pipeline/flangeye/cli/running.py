@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flangeye.cli.app import Overrides, RecipeName, app, load_plugins, read_recipe
-from flangeye.cli.console import at_work, of_foreign, say, say_notes
+from flangeye.cli.console import as_damage, progress_bar, say, say_notes
 from flangeye.errors import FlangeyeError, NothingMoved, StageError
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def run(  # noqa: PLR0913  one for each option
 ) -> None:
     """Run a recipe: a calibration, its log and its report."""
     from flangeye.devices import MotionAllowed
-    from flangeye.files.elsewhere import archive_at, results_at
+    from flangeye.files.remote import archive_at, results_at
     from flangeye.types import ArchivePath
     from flangeye.workflow.run.folder import RunFolder
     from flangeye.workflow.run.session import Start
@@ -167,8 +167,8 @@ def _explain_refusal(
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
-    from flangeye.files.elsewhere import with_urls
-    from flangeye.workflow.doctor import mended_together
+    from flangeye.files.remote import with_urls
+    from flangeye.workflow.doctor import combined_fix
     from flangeye.workflow.log.read import read_run
     from flangeye.workflow.run.outlook import motions_to_add
 
@@ -182,7 +182,7 @@ def _explain_refusal(
     findings, known = _findings(log, registry, recipe)
     errors = with_urls(f"list each pose's error: flangeye show {quote(str(log.parent))} --outlook")
     if findings:
-        named, tried, steps = mended_together(findings)
+        named, tried, steps = combined_fix(findings)
         print_refusal(Console(), named, tried or wrong, [*filter(None, steps[:2])] or [errors])
         return
     failed = [step for step, found in result.verifications.items() if not found.passed]
@@ -226,8 +226,8 @@ def _findings(log: Path, registry: Registry, recipe: Recipe) -> tuple[Sequence[F
 
     try:
         with (
-            of_foreign(log, "it cannot be examined"),
-            at_work("looking for the mistake", len(registry.of_kind("check"))) as checked,
+            as_damage(log, "it cannot be examined"),
+            progress_bar("looking for the mistake", len(registry.of_kind("check"))) as checked,
         ):
             found = examined(log, registry, recipe, checked).findings
     except FlangeyeError as error:  # the log has too little for the doctor
@@ -278,7 +278,7 @@ def _record(
     from rich.console import Console
 
     from flangeye.cli.summary import RunProgress, print_summary
-    from flangeye.files.elsewhere import with_urls
+    from flangeye.files.remote import with_urls
     from flangeye.workflow.run.session import record_run
 
     try:
@@ -300,7 +300,7 @@ def _record(
 
 def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Start) -> None:
     """Print where the captures of a failed run are, and the commands that use them."""
-    from flangeye.files.elsewhere import with_urls
+    from flangeye.files.remote import with_urls
     from flangeye.workflow.run.restart import restart_hint, resumable
 
     seen = f"flangeye report {quote(str(folder.path))} shows it"
@@ -322,14 +322,14 @@ def _name_mistake(
     from rich.console import Console
 
     from flangeye.cli.summary import print_refusal
-    from flangeye.files.elsewhere import with_urls
-    from flangeye.workflow.doctor import mended_together
+    from flangeye.files.remote import with_urls
+    from flangeye.workflow.doctor import combined_fix
 
     if (read := start.archive.path or recipe.archive) is None:
         return
     findings, _ = _findings(folder.log, registry, recipe)
     if findings:
-        print_refusal(Console(stderr=True), *mended_together(findings))
+        print_refusal(Console(stderr=True), *combined_fix(findings))
     else:
         doctor = f"flangeye doctor {quote(str(read))} --recipe {quote(called)}"
         say(with_urls(f"{doctor} looks for a mistake"), err=True)

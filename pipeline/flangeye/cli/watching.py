@@ -80,7 +80,7 @@ def monitor(  # noqa: PLR0913  one argument an option
     from flangeye.workflow.doctor.monitor.chart import write_chart
     from flangeye.workflow.doctor.monitor.history import History, as_json, history_beside, only_user
     from flangeye.workflow.doctor.monitor.stored import stored_calibration
-    from flangeye.workflow.doctor.monitor.watchman import CODES, take, write_state
+    from flangeye.workflow.doctor.monitor.verdicts import CODES, take, write_state
 
     archive = [*(archive or ()), *(more or ())]
     if live == bool(archive):
@@ -133,7 +133,7 @@ def _checks(
 
 def _opcua_node(opcua: str, security: str | None) -> tuple[str, str]:
     from flangeye.errors import StageError
-    from flangeye.workflow.doctor.monitor.watchman import require_secured
+    from flangeye.workflow.doctor.monitor.verdicts import require_secured
 
     url, comma, node = opcua.partition(",")
     if not comma:

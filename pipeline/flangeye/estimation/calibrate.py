@@ -26,7 +26,7 @@ from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import marginal
-from flangeye.estimation.observability import meaningless, unobservable
+from flangeye.estimation.observability import symmetry_moves, unobservable
 from flangeye.estimation.session import ModelOptions, Session, session_of
 from flangeye.estimation.sightings import roll_note
 from flangeye.estimation.threads import on_one_thread
@@ -278,7 +278,7 @@ def _estimates(session: Session, answer: Answer, weak: Floats) -> list[Transform
     """
     problem, found = session.found.problem, session.found
     moved = _without(problem, problem.moved(found.places, answer.mean), weak)
-    rounds, out = meaningless(problem), {}
+    rounds, out = symmetry_moves(problem), {}
     for i, name in enumerate(problem.unknown):
         rows = slice(6 * i, 6 * i + 6)
         transform = Transform.named(session.cell.name_of(name), moved[name])

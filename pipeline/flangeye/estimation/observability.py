@@ -283,7 +283,7 @@ def require_enough(problem: Problem, needed: int) -> None:
         )
 
 
-def fewest(problem: Problem) -> int:
+def fewest_sightings(problem: Problem) -> int:
     """Return the fewest sightings of one camera and one target that determine the unknowns."""
     ranks, count = problem.seen.ranks, len(problem.unknown)
     if (ranks == 6).all():
@@ -296,7 +296,7 @@ def fewest(problem: Problem) -> int:
     return (5 if normals else 8) if placed else (4 if normals else 6)
 
 
-def meaningless(problem: Problem) -> Floats:
+def symmetry_moves(problem: Problem) -> Floats:
     """Return (P, k) unit moves that are unobservable by definition: turns of round targets.
 
     A circle's turn about its own axis is unobservable, and so is every turn of a centre.
@@ -364,7 +364,7 @@ def _meaningful(problem: Problem, places: Places) -> Floats:
 
     A round target's turn about its own axis does not.
     """
-    nothing = _turned(problem, places, meaningless(problem))
+    nothing = _turned(problem, places, symmetry_moves(problem))
     if not nothing.shape[1]:
         return np.eye(len(nothing))
     # Left singular vectors beyond the rank span the orthogonal complement

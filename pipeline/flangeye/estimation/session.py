@@ -19,7 +19,7 @@ from flangeye.estimation.graph import Carrier, Places, Problem
 from flangeye.estimation.mixed import TELLING, fit
 from flangeye.estimation.observability import (
     IN_LINE,
-    fewest,
+    fewest_sightings,
     require_enough,
     require_turns,
     spread_of,
@@ -152,7 +152,7 @@ def effects_of(problem: Problem, scanner: ScannerModel | None, asked: ModelOptio
 
 def _require_enough(problem: Problem) -> None:
     if len(problem.ends) == 1:
-        require_enough(problem, fewest(problem))
+        require_enough(problem, fewest_sightings(problem))
 
 
 # --- where to begin ------------------------------------------------------------------------------

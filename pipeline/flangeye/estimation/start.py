@@ -91,7 +91,7 @@ def size_of(problem: Problem) -> float:
     the places and the size (Andreff et al. 2001). Of small random subsets, the one that explains
     the better half of all poses best is taken. Only loops of two unknown places are used.
     """
-    (names, known), rng = circle_of(problem), np.random.default_rng(0)
+    (names, known), rng = loop_of(problem), np.random.default_rng(0)
     n, least, size = len(problem.seen), np.inf, 1.0
     if len(names) != 2:
         return size
@@ -254,7 +254,7 @@ def _form_of(loop: _Loop) -> _Form | None:
     return None
 
 
-def circle_of(problem: Problem) -> tuple[list[tuple[str, bool]], list[Floats]]:
+def loop_of(problem: Problem) -> tuple[list[tuple[str, bool]], list[Floats]]:
     """Return the unknowns along the loop of one camera and one target, and the known poses between.
 
     Each name comes with whether it is inverted; the (N, 4, 4) poses follow the unknowns in order.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 from pydantic import AfterValidator, BeforeValidator, PlainSerializer, ValidationInfo
 
 from flangeye.errors import StageError
-from flangeye.files.elsewhere import is_url, reaching, system_of
+from flangeye.files.remote import is_url, one_line_errors, system_of
 from flangeye.files.words import nearest
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class Storage(Protocol):
         """Remove a file, or a folder with its content, if it exists."""
 
 
-def place_at(at: str) -> Storage:
+def storage_at(at: str) -> Storage:
     """Return the store at a path or URL.
 
     Raises:
@@ -180,12 +180,12 @@ class _RemoteStorage:
         self._root = root.rstrip("/")
 
     def read(self, name: str) -> bytes | None:
-        with reaching(f"{self._url}/{name}"), suppress(FileNotFoundError):
+        with one_line_errors(f"{self._url}/{name}"), suppress(FileNotFoundError):
             return bytes(self._system.cat_file(f"{self._root}/{name}"))
         return None
 
     def write(self, name: str, content: bytes) -> None:
-        with reaching(f"{self._url}/{name}"):
+        with one_line_errors(f"{self._url}/{name}"):
             self._system.pipe_file(f"{self._root}/{name}", content)
 
     @contextmanager
@@ -193,16 +193,16 @@ class _RemoteStorage:
         with TemporaryDirectory(prefix="flangeye-") as folder:
             path = Path(folder) / "draft"
             yield path
-            with reaching(f"{self._url}/{name}"):
+            with one_line_errors(f"{self._url}/{name}"):
                 self._system.put_file(str(path), f"{self._root}/{name}")
 
     def names(self, folder: str) -> list[str]:
-        with reaching(f"{self._url}/{folder}"):
+        with one_line_errors(f"{self._url}/{folder}"):
             self._system.invalidate_cache()
             found = self._system.find(f"{self._root}/{folder}", maxdepth=1)
         return sorted(path.removeprefix(f"{self._root}/") for path in found)
 
     def remove(self, name: str) -> None:
-        with reaching(f"{self._url}/{name}"), suppress(FileNotFoundError):
+        with one_line_errors(f"{self._url}/{name}"), suppress(FileNotFoundError):
             self._system.invalidate_cache()
             self._system.rm(f"{self._root}/{name}", recursive=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.files.clouds import LengthUnit
-from flangeye.files.elsewhere import digest_elsewhere
+from flangeye.files.remote import remote_digest
 from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Note, Role
 
 MIN_CAPTURES = 3
@@ -208,7 +208,7 @@ def digests_of(files: Iterable[Path]) -> dict[Path, str]:
     digests: dict[Path, str] = {}
     for path in files:
         try:
-            elsewhere = digest_elsewhere(path)
+            elsewhere = remote_digest(path)
             digests[path] = elsewhere or _digest_of(path)
         except OSError as error:
             raise StageError(f"{path}: cannot be read: {error.strerror}") from None

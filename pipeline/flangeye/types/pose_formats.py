@@ -385,7 +385,7 @@ def other_conventions(rotation: str, angle: str | None) -> Iterator[RotationConv
         yield from ((other, unit) for unit in ("rad", "deg") if (other, unit) != (rotation, angle))
 
 
-def spelt(rotation: str, angle: str | None = None) -> str:
+def describe_rotation(rotation: str, angle: str | None = None) -> str:
     """Return a convention of rotations in words."""
     rotation = plain_rotation(rotation)
     names = {

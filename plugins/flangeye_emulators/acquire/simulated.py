@@ -39,7 +39,7 @@ from flangeye.types import (
 )  # fmt: skip
 from flangeye.types.geometry import invert
 from flangeye.units import in_mm, param
-from flangeye.workflow.run.ahead import cores, worked_ahead
+from flangeye.workflow.run.prefetch import cores, prefetched
 from flangeye_emulators.acquire.moments import UNSEEN, VERSION, fingerprint_of, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
@@ -260,7 +260,7 @@ class _Session:
         if at_once == 1:
             yield from map(captured, range(self.count))
         else:
-            with closing(worked_ahead(iter(range(self.count)), captured, at_once)) as working:
+            with closing(prefetched(iter(range(self.count)), captured, at_once)) as working:
                 for _, made in working:
                     yield made()
 

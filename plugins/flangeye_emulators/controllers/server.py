@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.files.elsewhere import is_this_machine
+from flangeye.files.remote import is_this_machine
 from flangeye.models.graph import EmulatorOptions
 from flangeye_emulators.controllers.arm import ControlUnit, SpringSurface, starting_joints
 from flangeye_emulators.controllers.client import CONTROL_PORT

@@ -12,8 +12,8 @@ from flangeye.plugin.stage import Params, part
 from flangeye.types import Seed
 from flangeye.units import Length, param
 from flangeye_emulators.finger.sensor import SimulatedFinger
-from flangeye_emulators.weld_world.truth import LookTruth
-from flangeye_emulators.weld_world.world import Shutter, WeldWorld
+from flangeye_emulators.weld_world.truth import ProfilerTruth
+from flangeye_emulators.weld_world.world import ImageQueue, WeldWorld
 
 
 class SimulatedProfilerParams(Params):
@@ -32,7 +32,7 @@ class SimulatedProfiler(Device):
     """
 
     def __init__(
-        self, finger: SimulatedFinger, robot: StateSource, seed: Seed, truth: LookTruth
+        self, finger: SimulatedFinger, robot: StateSource, seed: Seed, truth: ProfilerTruth
     ) -> None:
         """Mount the sensor behind the torch of a simulated finger."""
         self.name, self.behind = f"look behind the torch of {finger.name}", truth.behind
@@ -58,15 +58,15 @@ def profiler_simulated(
         raise StageError(
             f"profiler.simulated sees the weld of sensor.simulated_finger, not of {sensor.name}"
         )
-    return SimulatedProfiler(sensor, robot, seed, LookTruth(params.behind))
+    return SimulatedProfiler(sensor, robot, seed, ProfilerTruth(params.behind))
 
 
 class LookBehind:
     """Measures the true bead, independently of the controller's estimate."""
 
-    def __init__(self, truth: LookTruth, rng: np.random.Generator) -> None:
+    def __init__(self, truth: ProfilerTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
-        self._shutter: Shutter[float] = Shutter(truth.clock, rng)
+        self._shutter: ImageQueue[float] = ImageQueue(truth.clock, rng)
         self._along: list[float] = []
         self._off: list[float] = []
         self._began: float | None = None

@@ -21,7 +21,7 @@ from flangeye.types.geometry import rotation_exp, rotation_from_rpy, rotation_lo
 from flangeye.units import Duration, Length, param
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.truth import ToolFile, ToolPath, WeldTruth, WorldPath
-from flangeye_emulators.weld_world.world import Nominal, Shutter, WeldWorld
+from flangeye_emulators.weld_world.world import ImageQueue, Nominal, WeldWorld
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
@@ -78,7 +78,7 @@ class SimulatedFinger(Device):
         self._rng = np.random.default_rng([seed, 11])
         self._camera = FingerCamera(finger, Optics(), self._rng)
         self._compliance = typical_compliance()
-        self._shutter: Shutter[Floats] = Shutter(
+        self._shutter: ImageQueue[Floats] = ImageQueue(
             replace(truth.clock, hidden=params.hidden), self._rng
         )
         self._started: int | None = None

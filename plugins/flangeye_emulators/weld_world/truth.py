@@ -190,7 +190,7 @@ class HeatTruth:
 
 
 @checked
-class LookTruth:
+class ProfilerTruth:
     """True position, noise and timing of a profile sensor behind the torch.
 
     Attributes:

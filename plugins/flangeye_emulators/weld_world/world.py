@@ -311,7 +311,7 @@ class TimestampedExposure(NamedTuple, Generic[Item]):
     item: Item
 
 
-class Shutter(Generic[Item]):
+class ImageQueue(Generic[Item]):
     """Queue of exposures in transit from the camera to the reader."""
 
     def __init__(self, truth: ClockTruth, rng: np.random.Generator) -> None:

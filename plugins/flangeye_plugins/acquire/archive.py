@@ -12,8 +12,8 @@ import numpy as np
 from flangeye import StageError, stage
 from flangeye.files.clouds import PER_METRE, LengthUnit
 from flangeye.files.depth import check_scan, read_scan
-from flangeye.files.elsewhere import is_elsewhere
 from flangeye.files.recording import Archive, Recording, check_distinct_clouds, digests_of
+from flangeye.files.remote import is_remote
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import (
     ScannerData,
@@ -120,7 +120,7 @@ def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[st
             # What is set aside must be known now, so then the inside is looked at too.
             if unreadable == "reject":
                 read_scan(cloud)
-            elif not is_elsewhere(cloud):
+            elif not is_remote(cloud):
                 check_scan(cloud)
         except StageError as error:
             if unreadable == "refuse":

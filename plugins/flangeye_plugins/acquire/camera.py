@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from flangeye import Params, StageError
-from flangeye.files.elsewhere import at_hand
 from flangeye.files.images import ImageError, decode_image
 from flangeye.files.regular import MAX_FILE, read_regular
+from flangeye.files.remote import at_hand
 from flangeye.maths.statistics import rms
 from flangeye.types import Floats, Image, PointCloud
 

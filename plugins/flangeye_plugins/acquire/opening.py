@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, Choose, Params, RecipePath, StageError
-from flangeye.files.elsewhere import with_urls
 from flangeye.files.recording import (
     MAX_REACH,
     MIN_CAPTURES,
@@ -24,6 +23,7 @@ from flangeye.files.recording import (
     digests_of,
     fingerprint_of,
 )
+from flangeye.files.remote import with_urls
 from flangeye.files.scans import with_companion
 from flangeye.maths.pose_corrections import inverted, scaled
 from flangeye.models.cell import Axis, Cell

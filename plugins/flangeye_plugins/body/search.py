@@ -163,7 +163,7 @@ def _hides(shape: Shape, scan: Floats, depth: Floats) -> Mask:
     return ~(scan[..., 2] > depth - 0.1 * shape.size)
 
 
-def opposed(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
+def contradicted_facets(shape: Shape, view: CoarseImage, pose: Floats) -> Mask | None:
     """Return the mask (T,) of facets in parts that the scan contradicts; None if there are none.
 
     A part is a connected component of the mesh. It is contradicted if a tenth of the measurements

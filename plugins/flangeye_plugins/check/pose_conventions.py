@@ -16,10 +16,10 @@ from flangeye.types.pose_formats import (
     EULER_ORDERS,
     QUATERNIONS,
     RotationConvention,
+    describe_rotation,
     is_known,
     other_conventions,
     plain_rotation,
-    spelt,
 )
 from flangeye.workflow.doctor.diagnosis import (
     OR_ELSE,
@@ -90,7 +90,7 @@ def _written_otherwise(session: RecordedSession) -> Iterator[Reread]:
             with suppress(StageError):  # the numbers are not poses in it
                 read = session.again(changes if of_arm else {}, changes if of_target else {})
                 if read.ids == session.ids:
-                    yield Reread(read, name, spelt(*said), spelt(*other))
+                    yield Reread(read, name, describe_rotation(*said), describe_rotation(*other))
 
 
 def _said(session: RecordedSession, of: str | None = None) -> RotationConvention | None:
@@ -119,8 +119,8 @@ def _of_arms(session: RecordedSession) -> Iterator[Reread]:
             yield Reread(
                 reread_session,
                 f"{whose} rotations",
-                spelt(read_as),
-                spelt(written_as),
+                describe_rotation(read_as),
+                describe_rotation(written_as),
             )
 
 
@@ -133,11 +133,16 @@ def _of_markers(session: RecordedSession) -> Iterator[Reread]:
         change = _rereading(read_as, written_as)
         told = {"rotation": [read_as, written_as]}
         alone = _with_markers(session, change).read_with(target=told)
-        yield Reread(alone, "the markers' rotations", spelt(read_as), spelt(written_as))
+        yield Reread(
+            alone,
+            "the markers' rotations",
+            describe_rotation(read_as),
+            describe_rotation(written_as),
+        )
         if stated == _stated(session):
             both = _with_markers(session, change).corrected(change, "both", robot=told, target=told)
             whose = "the rotations of robot and markers"
-            yield Reread(both, whose, spelt(read_as), spelt(written_as))
+            yield Reread(both, whose, describe_rotation(read_as), describe_rotation(written_as))
 
 
 def _has_ready_made_markers(session: RecordedSession) -> bool:

@@ -161,11 +161,13 @@ def _exchanged(recording: Recording) -> Recording:
         raise StageError(f"{recording.id}: exchanged: there is no marker's pose beside the robot's")
     poses = {**recording.poses, FLANGE: marker}
     seen = recording.poses[FLANGE]
+    # Motion and joints belong to the arm, whose pose is now that of the target
     return replace(recording, poses=poses, camera_T_target=seen, motion=None, joints=None)
 
 
 def _corrected(poses: Floats, params: CorrectedParams) -> Floats:
     """Return one arm's corrected poses (N, 4, 4)."""
+    # The offset leads from the recorded point to the target, so it is added
     return without_tool(params.robot.undone(poses), -np.array(params.offset))
 
 

@@ -153,6 +153,7 @@ def _opened(file: Path) -> Iterator[sqlite3.Connection]:
     Raises:
         StageError: The database is not a ROS 2 bag.
     """
+    # Read only: SQLite would otherwise create a missing file
     with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as database:
         tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         if not {("topics",), ("messages",)} <= set(tables):
@@ -229,6 +230,7 @@ def pose_of(where: str, position: Any, turn: Any) -> Floats:
 
 def in_order(times: Sequence[float], values: Sequence[Floats]) -> Stream:
     """Return a stream sorted by time, with one value for each time."""
+    # Interpolation needs ascending times, each once; several publishers may repeat one
     moments, first = np.unique(np.array(times), return_index=True)
     return moments, np.array(values)[first]
 

@@ -341,6 +341,7 @@ class GenicamScanner(OpenScanner):
             )
         with buffer:
             return {
+                # The producer reuses the buffer's memory for the next frame
                 part.data_format: np.reshape(part.data, (part.height, -1)).copy()
                 for part in buffer.payload.components
             }

@@ -200,7 +200,7 @@ def _misdrawn(
 ) -> Rejected | None:
     """Return a rejection if a corrected version of the mesh is found instead; None if not."""
     from flangeye_plugins.body.looks import Looks, prepared
-    from flangeye_plugins.body.search import FINE_ACROSS, BodySearch, opposed
+    from flangeye_plugins.body.search import FINE_ACROSS, BodySearch, contradicted_facets
     from flangeye_plugins.body.view import view_of
 
     for what, fix, other in _otherwise(body):
@@ -212,7 +212,7 @@ def _misdrawn(
     holds = partial(_passes, coverage=0.0, trust=0.93, goes_on=0.1, weakest=FIRM / 2)
     view, held = view_of(points, shape.size / FINE_ACROSS), list[tuple[float, Floats]]()
     for pose in (one.pose for one in every):
-        gone = opposed(shape, view, pose)
+        gone = contradicted_facets(shape, view, pose)
         if gone is not None:
             rest = Looks(vertices, facets[~gone].astype(np.int32), mounted=True)
             near = filter(holds, BodySearch(points, rest).near(pose[None]))

@@ -15,7 +15,7 @@ from flangeye.estimation.closed.separable import andreff, horaud_dornaika, park_
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.observability import (
     FINEST_NOISE,
-    fewest,
+    fewest_sightings,
     information_of_centres,
     require_enough,
     require_observable,
@@ -27,7 +27,7 @@ from flangeye.estimation.observability import (
     robust_sigma,
 )
 from flangeye.estimation.sightings import problem_of
-from flangeye.estimation.start import circle_of, start_of_circles
+from flangeye.estimation.start import loop_of, start_of_circles
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
@@ -75,7 +75,7 @@ def solve_closed(
     """
     observations, cell, scanner = given
     problem = problem_of(observations, cell)
-    require_enough(problem, fewest(problem))
+    require_enough(problem, fewest_sightings(problem))
     require_turns(problem)
     try:
         places = solver(problem)
@@ -121,7 +121,7 @@ def by_three(
             raise StageError(f"{needed} poses needed, {len(problem.seen)} given")
         # Equation (5) of the paper: X K0 Z^-1 K1 Y^-1 K2 = 1 round the circle is A X B = Y C Z with
         # A = K2, B = K0 and C = K1^-1
-        _, known = circle_of(problem)
+        _, known = loop_of(problem)
         x, y, z = method(known[2], known[0], invert(known[1]))
         return _as_named(problem, [x, invert(z), invert(y)])
 
@@ -152,7 +152,7 @@ def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
             "marker on or before one arm, or use solve.robust"
         )
     # Round the circle X M Z^-1 G = 1, with the carriers' pose G after the target's place
-    _, known = circle_of(problem)
+    _, known = loop_of(problem)
     return known[1], known[0]
 
 
@@ -161,7 +161,7 @@ def _placed(problem: Problem, x: Floats, other: Floats) -> Places:
 
 
 def _as_named(problem: Problem, found: Sequence[Floats]) -> Places:
-    names, _ = circle_of(problem)
+    names, _ = loop_of(problem)
     return {
         name: invert(place) if back else place
         for (name, back), place in zip(names, found, strict=True)

@@ -27,7 +27,7 @@ from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTas
 from flangeye_plugins.weld.passes import MultiPassController, follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
-from flangeye_plugins.weld.weld_log import LoggedLooks
+from flangeye_plugins.weld.weld_log import LoggedProfiles
 
 RUN_IN = 2 * SETTLING
 """Run-in before the arc, in which the torch recovers from its displacement by the sweep [m]."""
@@ -70,7 +70,7 @@ def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
     return part.bind(part.params.model_validate(given, context=lookup) if part.params else None)
 
 
-def take_looks(controller: Controller, looks: Sequence[WeldProfile]) -> None:
+def take_profiles(controller: Controller, looks: Sequence[WeldProfile]) -> None:
     """Pass new bead profiles to a controller, if it follows by touch."""
     follower = follower_of(controller)
     if follower is not None:
@@ -140,7 +140,7 @@ class LoggedWeld:
         self.controller = controller_from(start)
         self.felt: dict[int, Touch | None] = {}
         self.newest, self.cycles = -1, 0
-        self._looks = LoggedLooks()
+        self._looks = LoggedProfiles()
 
     def take(self, note: JournalEntry) -> None:
         """Process the next log entry."""
@@ -167,7 +167,7 @@ class LoggedWeld:
     def _decide(self, cycles: Mapping[str, list[Any]]) -> None:
         for i, time in enumerate(cycles["time"]):
             pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
-            take_looks(self.controller, self._looks.of(self.cycles))
+            take_profiles(self.controller, self._looks.of(self.cycles))
             self.cycles += 1
             felt = [self.felt[number] for number in cycles["touches"][i]]
             command = self.controller.step(pose, [touch for touch in felt if touch is not None])

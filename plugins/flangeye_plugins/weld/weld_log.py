@@ -142,7 +142,7 @@ class WeldLog:
         self._log(name, columns(value) if name == "cycles" else value)
 
 
-class LoggedLooks:
+class LoggedProfiles:
     """The logged bead profiles by cycle, for stepping through a logged weld."""
 
     def __init__(self) -> None:

@@ -21,8 +21,8 @@ from flangeye_emulators.weld_world.truth import (
 from flangeye_emulators.weld_world.world import (
     ArmError,
     ArmResponse,
+    ImageQueue,
     SeamDistortion,
-    Shutter,
     TrueFinger,
     TrueTool,
     true_groove,
@@ -98,13 +98,13 @@ def test_the_finger_shows_less_and_later_than_it_feels() -> None:
 
 def test_images_are_late_lost_and_wrongly_stamped() -> None:
     truth = ClockTruth(rate=100, latency=0.05, jitter=0.0, stamp=0.02, dropped=0)
-    shutter: Shutter[str] = Shutter(truth, RNG(0))
+    shutter: ImageQueue[str] = ImageQueue(truth, RNG(0))
     assert shutter.due(0.0)
     assert not shutter.due(0.005)
     shutter.expose(1.0, "image")
     assert shutter.arrived(1.04) is None
     assert shutter.arrived(1.06) == (1.02, "image")
-    lossy: Shutter[int] = Shutter(ClockTruth(dropped=0.5), RNG(0))
+    lossy: ImageQueue[int] = ImageQueue(ClockTruth(dropped=0.5), RNG(0))
     for i in range(200):
         lossy.expose(float(i), i)
     assert 70 < sum(lossy.arrived(1e9) is not None for _ in range(200)) < 130

@@ -395,7 +395,7 @@ def test_requests_are_answered_one_after_the_other_and_silence_is_work(
 def test_what_only_reads_commands_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     left: list[int] = []
     monkeypatch.setattr(os, "_exit", left.append)
-    onlooker = worker.Onlooker()
+    onlooker = worker.ReadOnlyCommander()
     onlooker.idle()
     onlooker.answered()
     onlooker.give_up()

@@ -15,7 +15,7 @@ from flangeye.types import Seed
 from flangeye.workflow.log.record import Recorder
 from flangeye.workflow.run.replay import replay_steps
 from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler_simulated
-from flangeye_emulators.weld_world.truth import ClockTruth, LookTruth, ToolTruth, WeldTruth
+from flangeye_emulators.weld_world.truth import ClockTruth, ProfilerTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
 from flangeye_plugins.weld.following.follower import Follower
@@ -186,7 +186,7 @@ def test_heat_around_the_torch_is_made_up_for_once_it_was_seen() -> None:
 
 def test_a_torch_that_the_files_have_elsewhere_is_told() -> None:
     world = WeldTruth(tool=ToolTruth(torch=(0.0, 1.5e-3)))
-    found = try_condition(Condition(world, look=LookTruth()), 0, SHORT, 16e-3)
+    found = try_condition(Condition(world, look=ProfilerTruth()), 0, SHORT, 16e-3)
     assert not found.done
     assert "the profile sensor behind the torch sees the bead +1." in found.controller.reason
     assert "calibrate the tool" in found.controller.reason

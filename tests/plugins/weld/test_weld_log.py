@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from flangeye.devices import WeldProfile
-from flangeye_plugins.weld.weld_log import Cycle, LoggedLooks, WeldLog, columns
+from flangeye_plugins.weld.weld_log import Cycle, LoggedProfiles, WeldLog, columns
 
 
 def cycle(i: int) -> Any:
@@ -70,7 +70,7 @@ def test_a_look_is_logged_with_the_cycle_that_takes_it_in_and_given_back_to_that
         log.looked(looks[2])
     told = [value for name, value in written if name == "look"]
     assert [each["cycle"] for each in told] == [0, 2, 2]
-    again = LoggedLooks()
+    again = LoggedProfiles()
     for each in told:
         again.take(each)
     assert [again.of(i) for i in range(4)] == [[looks[0]], [], looks[1:], []]

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from flangeye.files.paths import place_at
+from flangeye.files.paths import storage_at
 from flangeye.workflow.batch import dataset as module
 from flangeye.workflow.batch.dataset import Dataset, Ledger, columns_of, row_of
 from flangeye.workflow.batch.outcome import SessionOutcome
@@ -27,7 +27,7 @@ def row(i: int, status: Any = "verified", report: str | None = None) -> Any:
 @pytest.fixture
 def rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dataset:
     monkeypatch.setattr(module, "FILE_SESSIONS", 4)
-    return Dataset(place_at(str(tmp_path)), COLUMNS)
+    return Dataset(storage_at(str(tmp_path)), COLUMNS)
 
 
 def files(folder: Path) -> list[str]:
@@ -71,7 +71,7 @@ def test_sessions_that_stand_elsewhere_now_are_filed_anew(rows: Dataset, tmp_pat
 def test_parts_that_are_torn_or_of_other_columns_count_for_nothing(
     rows: Dataset, tmp_path: Path, torn: bytes
 ) -> None:
-    other = Dataset(place_at(str(tmp_path)), columns_of({"steps.0.noise": ["1"]}))
+    other = Dataset(storage_at(str(tmp_path)), columns_of({"steps.0.noise": ["1"]}))
     other.write_part(0, "a", [row(0) | {"steps.0.noise": 1}])
     (tmp_path / "sessions.parquet" / "000000-b.parquet").write_bytes(torn)
     assert not rows.finished(Ledger([session(0)]), report=False).any()

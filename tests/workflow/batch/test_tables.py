@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from flangeye.files.paths import place_at
+from flangeye.files.paths import storage_at
 from flangeye.workflow.batch import _write_results
 from flangeye.workflow.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
 from flangeye.workflow.batch.outcome import SessionOutcome
@@ -174,7 +174,7 @@ def test_the_table_sorts_in_a_browser(entries: Any, tmp_path: Path) -> None:
     if chromium is None:
         pytest.skip("no chromium on this machine: apt-get install chromium")
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    write_page(tally_of(entries), place_at(str(tmp_path)))
+    write_page(tally_of(entries), storage_at(str(tmp_path)))
     flags = ["--headless", "--no-sandbox", "--disable-gpu", "--host-resolver-rules=MAP * ~NOTFOUND"]
     problems: list[str] = []
     requested: list[str] = []

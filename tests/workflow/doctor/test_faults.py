@@ -19,7 +19,7 @@ from flangeye.maths.pose_corrections import (
 )
 from flangeye.maths.streams import later, passed, pose_at
 from flangeye.types.geometry import rigid, rotation_exp
-from flangeye.workflow.doctor import mended_together
+from flangeye.workflow.doctor import combined_fix
 from flangeye.workflow.doctor.diagnosis import Finding, RecordedSession, examine
 from flangeye_plugins.check import CHECKS
 from tests.crossing import crossed
@@ -520,7 +520,7 @@ def test_two_mistakes_are_both_named_and_one_line_mends_both() -> None:
     assert findings[-1].fix == (
         "- acquire.archive: {reader: {corrected: {reader: auto, robot: {scale: 0.001}}}, leave_out: ['004']}"
     )
-    wrong, known, steps = mended_together(findings)
+    wrong, known, steps = combined_fix(findings)
     assert wrong == f"{findings[0].what}; and {findings[1].what}"
     assert known.count(" before, ") == 2 and steps == [findings[-1].fix]
 

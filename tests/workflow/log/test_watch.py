@@ -18,7 +18,7 @@ from flangeye.errors import StageError
 from flangeye.plugin.registry import Registry
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder
-from flangeye.workflow.log.watch import RunView, follow, hidden_address, may_look, watch_run
+from flangeye.workflow.log.watch import RunView, follow, hidden_address, may_connect, watch_run
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.runner import Runner
 from tests.conftest import TOY_RECIPE
@@ -255,8 +255,8 @@ def test_no_other_page_than_foxgloves_own_may_look(origin: str | None, lets_in: 
 @pytest.mark.parametrize("name", ["Origin", "origin", "ORIGIN "])
 def test_an_origin_is_seen_wherever_it_stands(before: str, name: str) -> None:
     head = f"GET / HTTP/1.1\r\n{before}{name}: {{}}\r\n\r\n"
-    assert may_look(head.format("https://app.foxglove.dev").encode())
-    assert not may_look(head.format("http://evil.example").encode())
+    assert may_connect(head.format("https://app.foxglove.dev").encode())
+    assert not may_connect(head.format("http://evil.example").encode())
 
 
 def test_what_a_program_sends_reaches_no_terminal(caplog: pytest.LogCaptureFixture) -> None:

@@ -91,7 +91,7 @@ def test_what_a_library_says_without_memory_is_said_to_be_that(
 
     monkeypatch.setattr(console, "require_memory", required)
     with pytest.raises(type(error) if plenty else SystemExit):
-        console.end_in_words(command)
+        console.report_errors(command)
     told = capsys.readouterr().err
     expected = f"error: not enough memory: {type(error).__name__}: {error}; fewer than 256 MB are"
     assert told == "" if plenty else told.startswith(expected)

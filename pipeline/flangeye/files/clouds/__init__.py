@@ -19,7 +19,7 @@ from flangeye.files.clouds.pcd import Viewpoint, open_pcd
 from flangeye.files.clouds.plain import STATED, open_npy, open_npz, open_text
 from flangeye.files.clouds.ply import open_ply
 from flangeye.files.clouds.table import Points, PointTable, refuse
-from flangeye.files.elsewhere import at_hand
+from flangeye.files.remote import at_hand
 from flangeye.types import CAMERA, PointCloud
 
 

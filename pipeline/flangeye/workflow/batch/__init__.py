@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flangeye.errors import FlangeyeError
-from flangeye.files.elsewhere import is_url
+from flangeye.files.remote import is_url
 from flangeye.files.words import printable
 from flangeye.workflow.batch.cluster import (
     check_installed,

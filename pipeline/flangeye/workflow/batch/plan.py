@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import flangeye
 from flangeye import types as t
 from flangeye.errors import RecipeError, StageError
-from flangeye.files.elsewhere import is_url, print_of
 from flangeye.files.paths import VERSION
+from flangeye.files.remote import is_url, remote_fingerprint
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart, Params
 from flangeye.workflow.batch.outcome import BatchError, Request
@@ -46,7 +46,7 @@ class Fingerprints:
 
     def of_archive(self, archive: str) -> str:
         """Return the hash of an archive by path, or of a URL from the store's listing."""
-        return print_of(archive) if is_url(archive) else self.of(Path(archive))
+        return remote_fingerprint(archive) if is_url(archive) else self.of(Path(archive))
 
     def of_recipe(self, recipe: Recipe) -> list[str]:
         """Return path and fingerprint of every file or folder that a step's parameters name."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.files.elsewhere import is_url
+from flangeye.files.remote import is_url
 from flangeye.files.words import printable
 from flangeye.workflow.batch.dataset import Kind, Row
 from flangeye.workflow.batch.outcome import ACCEPTED, STATUSES, SessionOutcome, Status

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from flangeye.errors import FlangeyeError, RecipeError
-from flangeye.files.paths import place_at
+from flangeye.files.paths import storage_at
 from flangeye.models.model import Model, read_model
 from flangeye.units import Length
 from flangeye.workflow.batch import run_sessions
@@ -108,7 +108,7 @@ def _run(
     once = list({session.id: session for session in sessions}.values())
     out = str(request.out)
     run_sessions(request, out, once, {}, software_of(registry), console)
-    rows = Dataset(place_at(out), columns_of({})).rows(Ledger(once))
+    rows = Dataset(storage_at(out), columns_of({})).rows(Ledger(once))
     fields = SessionOutcome.__dataclass_fields__
     found = {row["session"]: SessionOutcome(**{name: row[name] for name in fields}) for row in rows}
     lost = [session.id for session in once if session.id not in found]

@@ -13,8 +13,8 @@ from functools import cache, cached_property
 from pathlib import Path
 
 from flangeye.errors import FlangeyeError, StageError
-from flangeye.files.elsewhere import archive_at, is_url, results_at
-from flangeye.files.paths import Storage, place_at
+from flangeye.files.paths import Storage, storage_at
+from flangeye.files.remote import archive_at, is_url, results_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.types import ArchivePath
 from flangeye.workflow.batch.dataset import Dataset, Kind, row_of
@@ -76,7 +76,7 @@ class Job:
     @cached_property
     def place(self) -> Storage:
         """The batch's folder."""
-        return place_at(self.out)
+        return storage_at(self.out)
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def evidence_of(finding: Finding) -> str:
     return f"{error}{likelier}; by chance {_chance(finding.probability)}"
 
 
-def mended_together(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
+def combined_fix(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
     """Return mistake, evidence and remedy of several findings as one answer.
 
     Each finding was made with the earlier ones corrected, so the last recipe line of a section

@@ -34,7 +34,7 @@ from flangeye.types import (
     PoseFeature,
     Transform,
 )
-from flangeye.types.pose_formats import LENGTHS, other_conventions, spelt
+from flangeye.types.pose_formats import LENGTHS, describe_rotation, other_conventions
 from flangeye.workflow.doctor.diagnosis import (
     Diagnosis,
     Finding,
@@ -274,7 +274,7 @@ def _rotations(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspicion]:
     """Yield other conventions in which the rotations of these tables may be written."""
     rotation, angle = _common(tables, "rotation"), _common(tables, "angle")
     for other in other_conventions(rotation, angle) if rotation is not None else ():
-        was, fits = spelt(rotation, angle), spelt(*other)
+        was, fits = describe_rotation(rotation, angle), describe_rotation(*other)
         changes: dict[Keys, Any] = {(*keys, "rotation"): other[0] for keys in tables}
         changes |= {(*keys, "angle"): other[1] for keys in tables if other[1]}
         what = f"the rotations of {whose} were read as {was}, and fit as {fits}"

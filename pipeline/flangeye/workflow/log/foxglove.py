@@ -31,6 +31,7 @@ def point_cloud(cloud: PointCloud, xyz: NDArray[np.float32], time_ns: int) -> An
     ]
     data = np.ascontiguousarray(xyz, dtype="<f4").tobytes()
     message = Message(frame_id=cloud.frame, point_stride=12, fields=fields, data=data)
+    # The identity; the default of all zeros is no rotation
     message.pose.orientation.w = 1.0
     message.timestamp.FromNanoseconds(time_ns)
     return message
@@ -66,6 +67,7 @@ def compressed_image(image: Image, time_ns: int) -> Any:
     import cv2
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
+    # OpenCV encodes from blue, green, red
     colour = image.pixels[..., ::-1] if image.pixels.ndim == 3 else image.pixels
     _, data = cv2.imencode(".png", np.ascontiguousarray(colour))
     message = CompressedImage(frame_id="camera", format="png", data=data.tobytes())
@@ -101,7 +103,10 @@ def _scene(
     entity.timestamp.FromNanoseconds(time_ns)
     for points, thickness in lines:
         line = entity.lines.add(
-            type=LinePrimitive.LINE_STRIP, thickness=thickness, scale_invariant=True
+            # Scale-invariant: the thickness is in pixels
+            type=LinePrimitive.LINE_STRIP,
+            thickness=thickness,
+            scale_invariant=True,
         )
         line.pose.orientation.w = 1.0
         line.color.r, line.color.g, line.color.b = colour
@@ -173,6 +178,7 @@ def foxglove_layout() -> str:
             | {"/scene": {"visible": True}, "/seam": {"visible": True}, "/pose": {"visible": True}},
         },
         "Image!camera": {"imageMode": {"imageTopic": "/capture/image"}},
+        # From INFO on
         "RosOut!log": {"minLogLevel": 2},
         "RawMessages!rejected": {"topicPath": "/rejection"},
     }

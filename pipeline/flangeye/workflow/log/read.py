@@ -265,6 +265,7 @@ class RunLog:
                     parts["scan"] = unpack(message.data, self.poses[capture]["shape"])
                 elif topic == "/capture/image":
                     parts["pixels"] = logged_image(message.data)
+                # The last message of a capture, after its scan and its image
                 elif topic == "/capture/cloud" and capture in self.poses:
                     yield self._logged_capture(capture, message.data, **parts)
             except Exception as error:  # what a foreign log holds can be wrong in any way
@@ -401,9 +402,11 @@ def _take(log: RunLog, message: LogMessage, clouds: dict[str, t.PointCloud]) -> 
     if topic.startswith("/note/"):
         log.noted.add(topic.removeprefix("/note/").rpartition("/")[0])
     elif schema == "foxglove.PointCloud" and topic.startswith("/step/"):
+        # A value's clouds are logged before it, on topics of their own
         clouds[topic] = _decode_cloud(message.data)
     elif topic == "/log":
         log.messages.append(_decode_log(message.data))
+    # A whole scan is packed and large: only `readings` unpacks it
     elif schema.startswith("flangeye.") and schema != "flangeye.Scan":
         _take_json(log, topic, schema.removeprefix("flangeye."), message.data, clouds)
 
@@ -467,6 +470,7 @@ def decode_json(raw: bytes) -> dict[str, Any]:
     most = 1 << 24  # decoded, a message takes forty times as much [bytes]
     if len(raw) > most:
         raise DamageError(f"it has {len(raw)} bytes; at most {most} are read")
+    # Python's parser would accept NaN and Infinity, which are not JSON
     data = json.loads(raw, parse_constant=_no_number)
     if not isinstance(data, dict):
         raise DamageError(f"it is not an object but of type {type(data).__name__}")
@@ -510,6 +514,7 @@ def logged_image(data: bytes) -> Any:
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
     pixels = decode_image(CompressedImage.FromString(data).data, cv2.IMREAD_UNCHANGED)
+    # OpenCV decodes to blue, green, red
     return pixels if pixels.ndim == 2 else pixels[..., ::-1]
 
 

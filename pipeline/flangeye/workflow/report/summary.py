@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye import types as t
-from flangeye.files.elsewhere import with_urls
+from flangeye.files.remote import with_urls
 from flangeye.types.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.workflow.report.facts import Facts
 from flangeye.workflow.report.units import degrees, millimetres, rounded_mm

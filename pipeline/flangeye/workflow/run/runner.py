@@ -30,8 +30,8 @@ from flangeye.workflow.recipe.load import Recipe
 from flangeye.workflow.recipe.steps import Step, bare
 from flangeye.workflow.result import calibrated_pose, require_one
 from flangeye.workflow.result.contract import Result
-from flangeye.workflow.run.ahead import FinishedCall, cores, worked_ahead
 from flangeye.workflow.run.outcome import Outcome, Stopwatch, Truths, result_of
+from flangeye.workflow.run.prefetch import FinishedCall, cores, prefetched
 from flangeye.workflow.run.restart import FromNothing
 
 
@@ -215,7 +215,7 @@ class Runner:
 
         Those still undecided after the last capture are rejected.
         """
-        from flangeye.estimation.alike import ambiguous, disambiguated
+        from flangeye.estimation.ambiguity import ambiguous, disambiguated
 
         if not self._held:
             return
@@ -258,7 +258,7 @@ class Runner:
 
     def _ahead(self, stream: t.Captures) -> Generator[t.Capture | t.Rejection]:
         """Yield the captures; the next ones are segmented and fitted meanwhile, on all cores."""
-        with closing(worked_ahead(iter(stream), self._meanwhile, cores())) as working:
+        with closing(prefetched(iter(stream), self._meanwhile, cores())) as working:
             for capture, self._done in working:
                 yield capture
 

@@ -76,7 +76,11 @@ class Publisher(threading.Thread):
     """Thread that writes every new sample into the mapped file."""
 
     def __init__(
-        self, receive: Any, commander: Commander | Onlooker, memory: mmap.mmap, period: float
+        self,
+        receive: Any,
+        commander: Commander | ReadOnlyCommander,
+        memory: mmap.mmap,
+        period: float,
     ) -> None:
         super().__init__(daemon=True)
         self._receive, self._commander = receive, commander
@@ -231,7 +235,7 @@ class Commander:
             raise WorkerRefused("the controller did not take the command")
 
 
-class Onlooker:
+class ReadOnlyCommander:
     """Replaces :class:`Commander` in a process that only reads."""
 
     remote = -1
@@ -299,7 +303,7 @@ def read_remote(answer: str) -> int:
     return {"true": 1, "false": 0}.get(answer.lower(), -1)
 
 
-def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
+def serve(line: socket.socket, commander: Commander | ReadOnlyCommander) -> None:
     """Execute requests from the socket until it closes."""
     while True:
         # Longest silence towards the controller [s]
@@ -314,7 +318,7 @@ def serve(line: socket.socket, commander: Commander | Onlooker) -> None:
         commander.answered()
 
 
-def answer(commander: Commander | Onlooker, request: dict[str, Any]) -> dict[str, Any]:
+def answer(commander: Commander | ReadOnlyCommander, request: dict[str, Any]) -> dict[str, Any]:
     """Execute one request and return its answer."""
     try:
         given = getattr(commander, request.pop("do"))(**request)
@@ -369,7 +373,9 @@ def main(host: str, period: float, memory: int, channel: int, reads_only: bool) 
         import rtde_receive
 
         receive = rtde_receive.RTDEReceiveInterface(host)
-        commander = Onlooker() if reads_only else Commander(connect(host), receive, period, shared)
+        commander = (
+            ReadOnlyCommander() if reads_only else Commander(connect(host), receive, period, shared)
+        )
     except Exception as error:
         line.send(json.dumps({"ok": False, "error": one_line(error)}).encode())
         os._exit(1)

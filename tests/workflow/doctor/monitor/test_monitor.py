@@ -27,7 +27,7 @@ from flangeye.workflow.doctor.monitor import from_arm
 from flangeye.workflow.doctor.monitor.chart import figure
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History
 from flangeye.workflow.doctor.monitor.stored import stored_calibration
-from flangeye.workflow.doctor.monitor.watchman import judge, write_state
+from flangeye.workflow.doctor.monitor.verdicts import judge, write_state
 from flangeye_plugins.reader.folder import FolderParams, folder
 from tests.fuzz.damage import spoilt
 from tests.workflow.doctor.monitor.cell import calibrate, check, part_of_sample
@@ -349,7 +349,7 @@ def test_a_plc_is_told_even_where_the_chart_cannot_be_written(
     (tmp_path / "h.html").mkdir()
     told: list[str] = []
     monkeypatch.setattr(
-        "flangeye.workflow.doctor.monitor.watchman.write_state",
+        "flangeye.workflow.doctor.monitor.verdicts.write_state",
         lambda url, node, finding, security: told.append(finding.state),
     )
     plc = ("--opcua", "opc.tcp://127.0.0.1:1,ns=2;s=x")

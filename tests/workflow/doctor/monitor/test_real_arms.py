@@ -14,7 +14,7 @@ from flangeye.estimation.watch.drift import DriftTest
 from flangeye.types import Observation
 from flangeye.workflow.doctor.monitor.history import History, MonitorCheck
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
-from flangeye.workflow.doctor.monitor.watchman import judge
+from flangeye.workflow.doctor.monitor.verdicts import judge
 
 RECIPE = "aubo-i5_phoxi-s_archive"
 

@@ -123,6 +123,7 @@ class RunView:
 
     def _take(self, message: LogMessage) -> None:
         topic, schema = message.channel.topic, message.channel.schema
+        # Clouds and images are for Foxglove alone
         if message.channel.encoding != "json":
             return
         content = decode_json(message.data)
@@ -282,7 +283,7 @@ async def _serve(
         with closing(writer), suppress(OSError, TimeoutError, EOFError, asyncio.LimitOverrunError):
             # Whoever says nothing for so long [s] is not a browser
             head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 10.0)
-            if may_look(head):
+            if may_connect(head):
                 await _joined(head, reader, writer, inside)
             else:
                 writer.write(
@@ -297,7 +298,7 @@ async def _serve(
     server.close()
 
 
-def may_look(head: bytes) -> bool:
+def may_connect(head: bytes) -> bool:
     """Return whether a request may connect: a web page may only if it is Foxglove's own."""
     lines = head.decode("latin-1").split("\r\n")[1:]
     told = [
@@ -305,6 +306,7 @@ def may_look(head: bytes) -> bool:
         for k, _, v in (line.partition(":") for line in lines)
         if k.strip().lower() == "origin"
     ]
+    # A browser states the origin of every web socket; programs state none
     return all(o in ("https://app.foxglove.dev", "file://") for o in told)
 
 
@@ -325,6 +327,7 @@ async def _joined(
 ) -> None:
     further, back = await asyncio.open_connection(*inside)
     with closing(back):
+        # The request was read for its origin; the server has to get it as well
         back.write(head)
         ways = (_handed(reader, back), _handed(further, writer))
         both = [asyncio.create_task(way) for way in ways]

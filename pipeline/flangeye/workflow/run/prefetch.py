@@ -54,7 +54,7 @@ def cores() -> int:
     return min(mine or 1, int(told)) if told.isdigit() and int(told) else mine or 1
 
 
-def worked_ahead(
+def prefetched(
     items: Iterator[Item], work: Callable[[Item], Made], workers: int
 ) -> Generator[tuple[Item, Callable[[], Made]]]:
     """Yield each item in order with a function that returns or raises its result.

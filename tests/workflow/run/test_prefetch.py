@@ -14,7 +14,7 @@ from flangeye.plugin.registry import Registry, load_registry
 from flangeye.workflow.recipe.find import find_recipe
 from flangeye.workflow.recipe.load import load_recipe, parse_recipe
 from flangeye.workflow.run import runner
-from flangeye.workflow.run.ahead import FinishedCall, cores, worked_ahead
+from flangeye.workflow.run.prefetch import FinishedCall, cores, prefetched
 from flangeye.workflow.run.runner import Runner
 from flangeye_emulators.acquire import simulated
 from flangeye_emulators.world.scanner import StructuredLight
@@ -27,7 +27,7 @@ def test_results_come_in_order_whatever_finishes_first() -> None:
         time.sleep(0.002 * (k % 3))
         return k * k
 
-    assert [(k, done()) for k, done in worked_ahead(iter(range(20)), work, 3)] == [
+    assert [(k, done()) for k, done in prefetched(iter(range(20)), work, 3)] == [
         (k, k * k) for k in range(20)
     ]
 
@@ -40,7 +40,7 @@ def test_no_more_is_pulled_than_workers_and_two() -> None:
             pulled.append(k)
             yield k
 
-    ahead = worked_ahead(items(), lambda k: k, 2)
+    ahead = prefetched(items(), lambda k: k, 2)
     for k in range(5):
         next(ahead)
         assert len(pulled) <= k + 1 + 2
@@ -56,7 +56,7 @@ def test_as_many_are_begun_as_there_are_workers_and_one_waits() -> None:
             pulled.append(k)
             yield k
 
-    ahead = worked_ahead(items(), lambda _: may_end.wait(10), 2)
+    ahead = prefetched(items(), lambda _: may_end.wait(10), 2)
     next(ahead)
     assert pulled == [0, 1, 2]
     may_end.set()
@@ -85,7 +85,7 @@ def test_what_ends_the_items_is_raised_after_what_they_were() -> None:
 
     seen = []
     with pytest.raises(ValueError, match="torn"):
-        for item, done in worked_ahead(items(), lambda k: k, 4):
+        for item, done in prefetched(items(), lambda k: k, 4):
             seen.append((item, done()))
     assert seen == [(1, 1), (2, 2)]
 

@@ -1,9 +1,9 @@
-"""estimation.alike: poses that explain a scan alike, told apart by how the arm moved."""
+"""estimation.ambiguity: poses that explain a scan alike, told apart by how the arm moved."""
 
 import numpy as np
 import pytest
 
-from flangeye.estimation.alike import ambiguous, disambiguated
+from flangeye.estimation.ambiguity import ambiguous, disambiguated
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.types import (

@@ -45,7 +45,7 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
     with TemporaryDirectory(prefix="flangeye-") as folder:
         within = place.partition("::")[0].partition("://")[2]
         root = Path(folder).resolve() / (PurePosixPath(within).name or "archive")
-        _STANDING_IN[root] = stand_in = _StandIn(place, root)
+        _STANDING_IN[root] = stand_in = _Mirror(place, root)
         try:
             stand_in.lay_out()
             yield root
@@ -67,12 +67,12 @@ def results_at(place: str | None) -> Iterator[Path | None]:
         yield None if place is None else Path(place)
         return
     system, root = system_of(place)
-    with reaching(place):
+    with one_line_errors(place):
         if system.exists(root) and system.find(root):
             raise StageError(f"{place}: already holds files; name a new or empty folder")
     with TemporaryDirectory(prefix="flangeye-") as folder:
         local = Path(folder).resolve() / "run"
-        _STANDING_IN[local] = _StandIn(place, local)
+        _STANDING_IN[local] = _Mirror(place, local)
         try:
             yield local
         except FlangeyeError as error:
@@ -80,7 +80,7 @@ def results_at(place: str | None) -> Iterator[Path | None]:
             raise
         finally:
             if local.is_dir():
-                with reaching(place):
+                with one_line_errors(place):
                     system.put(f"{local}/", f"{root.rstrip('/')}/", recursive=True)
             del _STANDING_IN[local]
 
@@ -99,13 +99,13 @@ def at_hand(path: Path) -> Iterator[None]:
         path.write_bytes(b"")
 
 
-def is_elsewhere(path: Path) -> bool:
+def is_remote(path: Path) -> bool:
     """Return whether a file must be fetched before it can be read."""
     stand_in = _of(path)
     return stand_in is not None and path in stand_in.later
 
 
-def digest_elsewhere(path: Path) -> str | None:
+def remote_digest(path: Path) -> str | None:
     """Return a hash of a remote file's content from the store; None for a local file."""
     stand_in = _of(path)
     return _state(stand_in.later[path]) if stand_in and path in stand_in.later else None
@@ -118,14 +118,14 @@ def with_urls(text: str) -> str:
     return text
 
 
-def print_of(url: str) -> str:
+def remote_fingerprint(url: str) -> str:
     """Return a hash of a remote archive's names and contents, from the store's listing."""
-    stand_in = _StandIn(url, Path("/"))
+    stand_in = _Mirror(url, Path("/"))
     lines = [f"{name}\0{_state(about)}\n" for name, about in sorted(stand_in.listed().items())]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-class _StandIn:
+class _Mirror:
     """A local folder that mirrors a remote one.
 
     Attributes:
@@ -141,7 +141,7 @@ class _StandIn:
 
     def listed(self) -> dict[str, Mapping[str, Any]]:
         """Return the store's entries below a URL by name; the name is "" for a single file."""
-        with reaching(self.url):
+        with one_line_errors(self.url):
             found = self._system.find(self._there, detail=True)
         if not found:
             raise StageError(f"{self.url}: holds nothing")
@@ -166,7 +166,7 @@ class _StandIn:
 
     def fetch(self, path: Path) -> None:
         """Fetch the content of one file into the local folder."""
-        with reaching(with_urls(str(path))):
+        with one_line_errors(with_urls(str(path))):
             self._system.get_file(self._names[path], str(path))
 
     def _name_of(self, path: str) -> str:
@@ -176,10 +176,10 @@ class _StandIn:
         return name
 
 
-_STANDING_IN: dict[Path, _StandIn] = {}
+_STANDING_IN: dict[Path, _Mirror] = {}
 
 
-def _of(path: Path) -> _StandIn | None:
+def _of(path: Path) -> _Mirror | None:
     return next((s for root, s in _STANDING_IN.items() if path.is_relative_to(root)), None)
 
 
@@ -206,7 +206,7 @@ def system_of(url: str) -> tuple[Any, str]:
     try:
         import fsspec
 
-        with reaching(url):
+        with one_line_errors(url):
             # A cached listing may be out of date, so the store is asked again.
             fresh = {"skip_instance_cache": True} if url.startswith("zip:") else {}
             system, path = fsspec.url_to_fs(url, **fresh)
@@ -220,7 +220,7 @@ def system_of(url: str) -> tuple[Any, str]:
 
 
 @contextmanager
-def reaching(url: str) -> Iterator[None]:
+def one_line_errors(url: str) -> Iterator[None]:
     """Turn any error of a remote store into one line.
 
     Raises:

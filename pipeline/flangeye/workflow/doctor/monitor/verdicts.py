@@ -20,7 +20,7 @@ from flangeye.estimation.watch.drift import (
     moved_since,
     verdict,
 )
-from flangeye.files.elsewhere import is_this_machine
+from flangeye.files.remote import is_this_machine
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History, MonitorCheck
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration
 

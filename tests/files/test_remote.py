@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 from flangeye.cli import commands
 from flangeye.errors import StageError
 from flangeye.files.clouds import read_cloud, write_cloud
-from flangeye.files.elsewhere import (
+from flangeye.files.remote import (
     archive_at,
     at_hand,
-    digest_elsewhere,
-    is_elsewhere,
+    is_remote,
     is_url,
-    print_of,
+    remote_digest,
+    remote_fingerprint,
     results_at,
     with_urls,
 )
@@ -57,7 +57,7 @@ def test_scans_are_fetched_one_at_a_time_and_let_go(bucket: Any, archive: Path) 
         assert (root / "poses.csv").read_text() == "cloud\n"
         for i in range(2):
             scan = root / "scans" / f"{i}.pcd"
-            assert is_elsewhere(scan) and scan.stat().st_size == 0
+            assert is_remote(scan) and scan.stat().st_size == 0
             assert read_cloud(scan).xyz[0, 0, 0] == 0.5 + i
             assert scan.stat().st_size == 0
         assert with_urls(f"{root}/scans") == "s3://cell/monday/scans"
@@ -70,12 +70,12 @@ def test_two_equal_scans_have_one_digest_and_a_changed_one_another_print(
     shutil.copy(archive / "scans" / "0.pcd", archive / "scans" / "2.pcd")
     bucket.put(f"{archive}/", "cell/monday/", recursive=True)
     with folder_at("s3://cell/monday") as root:
-        digests = [digest_elsewhere(root / "scans" / f"{i}.pcd") for i in range(3)]
+        digests = [remote_digest(root / "scans" / f"{i}.pcd") for i in range(3)]
     assert digests[0] == digests[2] != digests[1]
-    before = print_of("s3://cell/monday")
-    assert print_of("s3://cell/monday") == before
+    before = remote_fingerprint("s3://cell/monday")
+    assert remote_fingerprint("s3://cell/monday") == before
     bucket.pipe("cell/monday/poses.csv", b"other\n")
-    assert print_of("s3://cell/monday") != before
+    assert remote_fingerprint("s3://cell/monday") != before
 
 
 def test_an_archive_in_a_zip_file(archive: Path, tmp_path: Path) -> None:
