@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from flangeye import types as t
 from flangeye.plugin.registry import Registry
+from flangeye.types.geometry import rigid, rotation_from_rpy
 from flangeye.workflow.log.foxglove import (
     CLOUD_TOPICS,
     circle_points,
@@ -67,6 +68,28 @@ def test_the_flanges_are_in_base_once_solved(messages: Any) -> None:
     assert seen.frame_id == "base"
     first = points_of(messages["/capture/cloud"][0])
     assert np.allclose(points_of(seen), toy.BASE_T_CAMERA.apply(first), atol=1e-3)
+
+
+def test_what_a_camera_on_the_arm_sees_is_in_base_by_the_arm_s_pose(tmp_path: Path) -> None:
+    places = [t.Transform(t.BASE, t.FLANGE, rigid(rotation_from_rpy(0.1 * k, 0.0, 1.0), [k, 0, 1]))
+              for k in (0.0, 1.0)]  # fmt: skip
+    carried = t.Transform(t.FLANGE, t.CAMERA, rigid(rotation_from_rpy(0.0, 0.3, 0.0), [0, 0.1, 0]))
+    xyz = np.eye(3, dtype=np.float32)
+    recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
+    for number, pose in enumerate(places):
+        cloud, name = t.PointCloud(t.CAMERA, xyz), str(number)
+        recorder.flangeye_captured("0.acquire", t.Capture(name, cloud, t.by_frame(pose)), 0.1)
+        seen = t.FlangeCloud(cloud, np.zeros(3), np.array([0.0, 0.0, -1.0]))
+        recorder.flangeye_stage_finished("1.segment.toy", name, seen, 0.1)
+    estimate = t.TransformEstimate(carried, 1e-8 * np.eye(6), np.zeros(3))
+    recorder.flangeye_stage_finished("3.solve.toy", None, t.HandEye(estimate, (), "toy"), 0.1)
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        logged = list(reader.iter_decoded_messages(topics=["/base/flanges"], log_time_order=False))
+    shown = [points_of(message) for _, _, _, message in logged]
+    for points, pose in zip(shown, places, strict=True):
+        np.testing.assert_allclose(points, (pose @ carried).apply(xyz), atol=1e-6)
 
 
 def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import pytest
 from pydantic import BaseModel, ValidationError, create_model
 
 from flangeye.errors import StageError
-from flangeye.workflow.log.read import read_run
+from flangeye.workflow.log.read import decode_json, read_run
 from flangeye.workflow.log.records import LogFile, NotMcapError, reason_of
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -242,6 +242,13 @@ def test_a_log_of_another_program_is_told_from_one_of_ours_that_just_begins(tmp_
     assert read_run(path).source is None
     path.write_bytes(MAGIC + header("libmcap 1") + attachment("recipe.yaml", b"title: T") + end())
     assert read_run(path).text("recipe.yaml") == "title: T"
+
+
+def test_a_message_of_more_than_16_mb_is_not_decoded() -> None:
+    most = b"{}".ljust(1 << 24)
+    assert decode_json(most) == {}
+    with pytest.raises(ValueError, match="^it has 16777217 bytes; at most 16777216 are read$"):
+        decode_json(most + b" ")
 
 
 def test_what_is_wrong_is_one_short_line() -> None:
