@@ -142,6 +142,7 @@ def test_a_straight_move_goes_where_it_should_as_fast_as_was_asked(robot: Any) -
     np.testing.assert_allclose(state.base_T_flange.matrix, target.matrix, atol=1e-9)
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / robot.period
     assert 0.099 < speeds.max() < 0.1001
+    assert np.diff(speeds).max() / robot.period == pytest.approx(0.5, rel=0.02)
 
 
 def test_a_joint_move_goes_where_it_should(robot: Any) -> None:
@@ -151,7 +152,9 @@ def test_a_joint_move_goes_where_it_should(robot: Any) -> None:
     while states[-1].mode == "moving":
         states.append(robot.state())
     np.testing.assert_allclose(states[-1].joints, target, atol=1e-9)
-    assert np.abs([s.joint_speeds for s in states]).max() == pytest.approx(0.5, abs=1e-6)
+    speeds = np.abs([s.joint_speeds for s in states]).max(axis=1)
+    assert speeds.max() == pytest.approx(0.5, abs=1e-6)
+    assert np.diff(speeds).max() / robot.period == pytest.approx(2.0, rel=0.02)
 
 
 def test_a_slower_move_than_a_thousandth_of_the_limit_has_that_speed(robot: Any) -> None:
@@ -232,6 +235,22 @@ def test_a_motion_that_nobody_looks_at_is_stopped_once(robot: Any, connection: S
     assert np.abs(settle(robot).joints - start).max() < 0.1
     time.sleep(3 * SILENT)
     assert connection.moves == ["JointMotion", "JointStopMotion"]
+
+
+def test_silence_is_looked_for_at_least_every_fiftieth_of_a_second(
+    connection: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        time.sleep(seconds)
+
+    clock = SimpleNamespace(monotonic=time.monotonic, monotonic_ns=time.monotonic_ns, sleep=sleep)
+    monkeypatch.setattr("flangeye_plugins.robot.franky.time", clock)
+    with robot_on(connection):
+        time.sleep(0.1)
+    assert slept and max(slept) <= 0.02
 
 
 def test_what_is_touched_is_felt(robot: Any, connection: StandIn) -> None:
