@@ -201,13 +201,9 @@ def _split_advice(message: str) -> tuple[str, str]:
 
     Brackets are skipped, since a line of a recipe in them contains colons.
     """
-    flat = message
-    while (bare := re.sub(r"[({][^(){}]*[)}]", lambda m: "_" * len(m[0]), flat)) != flat:
-        flat = bare
-    for mark in ("; ", ": "):
-        if (at := flat.find(mark)) > 0:
-            return message[:at], message[at + 2 :]
-    return message, ""
+    flat = re.sub(r"\([^)]*\)|\{[^}]*\}", lambda found: "_" * len(found[0]), message)
+    at = max(flat.find("; "), 0) or flat.find(": ")
+    return (message[:at], message[at + 2 :]) if at > 0 else (message, "")
 
 
 def _after_verification(recipe: Recipe) -> list[str]:

@@ -122,6 +122,7 @@ class Ros2Scanner(OpenScanner):
             if topic:
                 runs = bridge.awaited(partial(_running, bridge, topic))
                 self._kinds[topic] = runs.type if runs and runs.type in kinds else kinds[0]
+                # On request only, as a camera's whole stream is large
                 bridge.follow(topic, self._kinds[topic], always=False)
         self._looks = bool(params.depth or params.image)
         if self._looks:
@@ -147,6 +148,7 @@ class Ros2Scanner(OpenScanner):
         It raises ``silent`` if no message arrives although the publisher runs.
         """
         until = time.monotonic() + self._params.timeout
+        # Before the trigger, or the answer of a fast camera would be missed
         wanted = {topic: self._bridge.want(topic, started) for topic in self._kinds}
         self._trigger()
         try:
@@ -193,6 +195,8 @@ class Ros2Scanner(OpenScanner):
                 f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s; camera_info "
                 "names another topic"
             )
+        # By ROS convention a rectified image says so in its topic, and has a matrix of its own in
+        # CameraInfo
         rectified = "rect" in str(self._params.depth or self._params.image).rpartition("/")[2]
         info = decoded(message.data, Type.INFO)
         pinholes = ("", "plumb_bob", "rational_polynomial")  # whose coefficients are OpenCV's

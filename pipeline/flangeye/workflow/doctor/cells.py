@@ -214,6 +214,8 @@ def _likeliest(
         with suppress(FlangeyeError):  # so the numbers are not poses, or not those of a cell
             mended = session.read_with(suspicion.changes)
             if _possible(mended.observations):
+                # No slow search from random places: once the true mistake is corrected, closed
+                # forms suffice
                 tried.append((predicted(mended, search=False), suspicion))
     if not tried:
         return []

@@ -96,7 +96,9 @@ def _number(observation: Observation) -> str:
 def _moved(name: str, cell: Cell, seen: Sequence[Observation]) -> Iterator[Sequence[Any]]:
     mover = cell.movers[name]
     yield ("number", "value") if isinstance(mover, Axis) else (*POSE_COLUMNS, *_joints(name, seen))
+    # One row for each moment, at which several cameras may have seen a target
     moments = {_number(o): o for o in seen}
+    # Numbers may lack leading zeros: a longer one is larger
     for number in sorted(moments, key=lambda number: (len(number), number)):
         pose, joints = moments[number].poses[name], moments[number].arm_joints.get(name, ())
         yield number, *(_value(mover, pose) if isinstance(mover, Axis) else (*_pose(pose), *joints))
@@ -135,6 +137,7 @@ def _csv(rows: Iterator[Sequence[Any]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for row in rows:
+        # Twelve digits: a picometre at a metre
         writer.writerow([x if isinstance(x, str) else f"{x:.12g}" for x in row])
     return text.getvalue()
 
