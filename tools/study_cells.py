@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from flangeye.estimation.plan import errors_at_work, so_far, work_of_frames
+from flangeye.estimation.plan import errors_at_work, estimate_so_far, work_of_frames
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
 from flangeye.types import ArchivePath
@@ -46,7 +46,7 @@ def levels(cell, plan, seed, every=1):
     for sighting in sightings:
         seen.append(sighting)
         if len(seen) % every == 0:
-            found = so_far(seen, model)
+            found = estimate_so_far(seen, model)
         if found is not None and len(seen) % every == 0:
             stated = max(errors_at_work(found, model, seen).values())
             yield len(seen), stated, max(true_errors(found, model, seen, truth))

@@ -9,7 +9,7 @@ import numpy as np
 
 from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_emulators.finger.profiler import LookBehind
+from flangeye_emulators.finger.profiler import BeadProfiler
 from flangeye_emulators.weld_world.truth import ProfilerTruth, WeldTruth
 from flangeye_emulators.weld_world.world import ArmResponse, ImageQueue, Nominal, WeldWorld
 from flangeye_plugins.weld.following.follower import Follower
@@ -126,7 +126,9 @@ def run_trial(
     pose = ToolPose(1.0, np.asarray(start.position, dtype=np.float64), start.angle)
     arm = ArmResponse(truth.arm, pose, start.period)
     noise = truth.finger.noise * np.array([1.0, 1.0, 6.0])
-    look = None if start.look is None else LookBehind(start.look, np.random.default_rng([seed, 2]))
+    look = (
+        None if start.look is None else BeadProfiler(start.look, np.random.default_rng([seed, 2]))
+    )
     rows: list[Row] = []
     phases: list[str] = []
     while arm.pose.time < start.longest and controller.phase not in ("done", "stopped"):

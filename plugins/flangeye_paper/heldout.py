@@ -13,7 +13,7 @@ from flangeye.maths.statistics import rms
 from flangeye_paper.published import stored_results
 from flangeye_paper.tables import (
     METHOD_LOOKS,
-    Look,
+    PlotStyle,
     Row,
     SessionRow,
     dress,
@@ -26,11 +26,11 @@ from flangeye_paper.tables import (
 
 STAGE = "verify.holdout"
 
-HELD_OUT_METHODS: Mapping[str, Look] = {
+HELD_OUT_METHODS: Mapping[str, PlotStyle] = {
     "all-data": METHOD_LOOKS["all-data"],
     "algorithm-1": METHOD_LOOKS["algorithm-1-held-out"],
     "robust": METHOD_LOOKS["robust"],
-    "robust-joints": Look("solve.robust with joint offsets", "#0e7490"),
+    "robust-joints": PlotStyle("solve.robust with joint offsets", "#0e7490"),
 }
 
 

@@ -127,21 +127,21 @@ GROWTH = 1 / 7
 """Section 3.1: growth of the translational deviation with noise, iterative to all data."""
 
 
-class Look(NamedTuple):
+class PlotStyle(NamedTuple):
     """Label and style of a method in plots."""
 
     label: str
     colour: str
 
 
-METHOD_LOOKS: Mapping[str, Look] = {
-    "all-data": Look("least squares on all poses", "#64748b"),
-    "algorithm-1-oracle": Look("Algorithm 1, its cost knows the truth (emulation)", "#d97706"),
-    "algorithm-1-held-out": Look("Algorithm 1, held-out cost", "#be123c"),
-    "robust": Look("solve.robust", "#1d4ed8"),
+METHOD_LOOKS: Mapping[str, PlotStyle] = {
+    "all-data": PlotStyle("least squares on all poses", "#64748b"),
+    "algorithm-1-oracle": PlotStyle("Algorithm 1, its cost knows the truth (emulation)", "#d97706"),
+    "algorithm-1-held-out": PlotStyle("Algorithm 1, held-out cost", "#be123c"),
+    "robust": PlotStyle("solve.robust", "#1d4ed8"),
 }
-BOUND = Look("Cramér-Rao bound", "black")
-PRINTED = Look("the paper", "#15803d")
+BOUND = PlotStyle("Cramér-Rao bound", "black")
+PRINTED = PlotStyle("the paper", "#15803d")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, StageError, stage
 from flangeye.estimation.arm_parameters import ArmParameters, most_informative_poses, parameters_of
 from flangeye.estimation.calibrate import Options, answered
-from flangeye.estimation.effects.arm import known
+from flangeye.estimation.effects.arm import kinematics_and_joints
 from flangeye.estimation.plan import predict, predicted_poses
 from flangeye.estimation.session import Session, session_of
 from flangeye.maths.arm_correction import corrected_view
@@ -269,7 +269,9 @@ def _proposed(session: Session, told: ArmParameters, count: int) -> list[str]:
 
 def _candidates(session: Session) -> list[Observation]:
     """Return predicted sightings around the session's, at similar distances and incidence."""
-    arm, at = known(next(c for c in session.found.problem.carriers if c.frame == FLANGE))
+    arm, at = kinematics_and_joints(
+        next(c for c in session.found.problem.carriers if c.frame == FLANGE)
+    )
     rng, places = np.random.default_rng(0), session.found.places
     joints = at[rng.integers(len(at), size=300)]
     spread = 0.6  # of the joints from the last session's [rad]

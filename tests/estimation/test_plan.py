@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.plan import _moved, best_next, errors_at_work, predict, so_far
+from flangeye.estimation.plan import _moved, best_next, errors_at_work, estimate_so_far, predict
 from flangeye.files.paths import bundled
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
@@ -37,12 +37,12 @@ def session() -> Any:
 def test_the_choice_is_the_one_after_which_least_is_left_unknown(session: Any) -> None:
     """Against what solving again with each candidate states; the scanner that saw less is first."""
     cell, seen, candidates = session
-    found = so_far(seen, cell)
+    found = estimate_so_far(seen, cell)
     assert found is not None
 
     def left(candidate: Any) -> float:
         both = [*seen, candidate]
-        with_it = so_far(both, cell)
+        with_it = estimate_so_far(both, cell)
         assert with_it is not None
         return sum(e**2 for e in errors_at_work(with_it, cell, seen).values())
 

@@ -25,7 +25,7 @@ from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, marginal
 from flangeye.estimation.observability import unobservable
 from flangeye.estimation.session import ModelOptions, effects_of
 from flangeye.estimation.sightings import problem_of
-from flangeye.estimation.start import agreeing, begin
+from flangeye.estimation.start import agreeing, initial_guess
 from flangeye.estimation.threads import on_one_thread
 from flangeye.maths.statistics import largest_error_quantile
 from flangeye.models.cell import Cell, composed
@@ -75,16 +75,16 @@ class Preview:
 
 
 @on_one_thread
-def rough(
+def preview(
     problem: Problem, freedoms: Mapping[str, Floats] | None = None, search: bool = True
 ) -> Preview:
-    """Return a quick estimate; see :func:`begin` for ``search``.
+    """Return a quick estimate; see :func:`initial_guess` for ``search``.
 
     Raises:
         CalibrationRefused: No initial guess is found, or the sightings leave an unknown
             unobservable.
     """
-    places, squares = begin(problem, search)
+    places, squares = initial_guess(problem, search)
     agree, effects = agreeing(problem, squares), effects_of(problem, None, ModelOptions())
     # Two Gauss-Newton steps: the second leaves out what the first finds to be an outlier
     for _ in range(2):
@@ -100,10 +100,10 @@ def rough(
     return Preview(problem, places, effects, model, found, agree)
 
 
-def so_far(observations: Sequence[Observation], cell: Cell) -> Preview | None:
+def estimate_so_far(observations: Sequence[Observation], cell: Cell) -> Preview | None:
     """Return the estimate from the sightings so far; None while an unknown is unobservable."""
     with suppress(FlangeyeError, np.linalg.LinAlgError):
-        return rough(problem_of(observations, cell), cell.freedoms)
+        return preview(problem_of(observations, cell), cell.freedoms)
     return None
 
 

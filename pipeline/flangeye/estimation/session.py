@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
-from flangeye.estimation.effects.arm import arm_effects, known
+from flangeye.estimation.effects.arm import arm_effects, kinematics_and_joints
 from flangeye.estimation.effects.camera import camera_effects, drift_effects
 from flangeye.estimation.effects.clock import clock_effects, delayed
 from flangeye.estimation.effects.effect import Effect
@@ -25,7 +25,7 @@ from flangeye.estimation.observability import (
     spread_of,
 )
 from flangeye.estimation.sightings import branches_of, problem_of
-from flangeye.estimation.start import agreeing, begin, distances, size_of
+from flangeye.estimation.start import agreeing, distances, initial_guess, size_of
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.models.cell import Cell
@@ -165,7 +165,7 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
     spread = spread_of(problem.seen.centres)
     in_line = spread.width < IN_LINE * spread.length
     bare = problem.without_normals(circles) if placed and not in_line else problem
-    places, squares = begin(bare)
+    places, squares = initial_guess(bare)
     _require_agreement(bare, places, agreeing(bare, squares))
     if not (placed and circles.any()) or in_line:
         return problem, places, agreeing(problem, squares), ()
@@ -238,7 +238,7 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
         seen=replace(s, centres=s.centres * flip, rotations=s.rotations * np.outer(flip, flip)),
     )
     try:
-        there, _ = begin(mirrored)
+        there, _ = initial_guess(mirrored)
     except CalibrationRefused:
         return
     ours = float(np.median(distances(problem, places)))
@@ -294,7 +294,7 @@ def _likeliest(problem: Problem, carrier: Carrier, places: Places, agree: Mask) 
         tried.sort(key=lambda one: _cost(one, places))
     poses = np.asarray(problem.frames[carrier.frame].place)
     for one in tried:
-        arm, near = known(next(c for c in one.carriers if c.frame == carrier.frame))
+        arm, near = kinematics_and_joints(next(c for c in one.carriers if c.frame == carrier.frame))
         joints, reached = reached_from(arm, poses, near[0])
         if reached.all():
             return joints

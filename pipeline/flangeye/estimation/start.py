@@ -47,7 +47,7 @@ GOOD = 25.0
 the estimate judges again."""
 
 
-def begin(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
+def initial_guess(problem: Problem, search: bool = True) -> tuple[Places, Floats]:
     """Return an initial guess of the unknowns, and (N,) squared distances in units of the noise.
 
     Args:

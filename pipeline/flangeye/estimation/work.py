@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flangeye.estimation.effects.arm import joints_known, known
+from flangeye.estimation.effects.arm import joints_known, kinematics_and_joints
 from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import spread_evenly
@@ -95,7 +95,7 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
     poses = session[problem.seen.times[like]].copy()
     poses[:, :3, 3] = box[0] + (box[1] - box[0]) * evenly[:, :3]
     apart = np.linalg.norm(poses[:, None, :3, 3] - session[:, :3, 3], axis=2)
-    arm, joints = known(carrier)
+    arm, joints = kinematics_and_joints(carrier)
     # Started at the nearest recorded posture, the arm keeps its branch (elbow up or down)
     joints, reached = reached_from(arm, poses, joints[apart.argmin(axis=1)])
     if not reached.any():

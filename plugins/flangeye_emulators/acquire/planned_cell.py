@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.estimation.plan import Preview, best_next, predict, predicted_poses, so_far
+from flangeye.estimation.plan import Preview, best_next, estimate_so_far, predict, predicted_poses
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Axis, Cell, chain
 from flangeye.plugin.stage import PlaceParams
@@ -96,7 +96,7 @@ class NextBest:
         moments, cell = self._planned.moments, self._planned.moments.cell
         for _ in self._planned.scheduled:
             before = seen()
-            self._found = so_far(before, cell)
+            self._found = estimate_so_far(before, cell)
             chosen = self._choose(before) or self._left.pop(0)
             self._taken.add(chosen[0])
             if self._planned.view.sees(moments.pose(*chosen)[None])[0]:

@@ -37,7 +37,7 @@ class SimulatedProfiler(Device):
         """Mount the sensor behind the torch of a simulated finger."""
         self.name, self.behind = f"look behind the torch of {finger.name}", truth.behind
         self._world, self._robot = finger.world, robot
-        self._look = LookBehind(truth, np.random.default_rng([seed, 13]))
+        self._look = BeadProfiler(truth, np.random.default_rng([seed, 13]))
 
     def profile(self) -> WeldProfile | None:
         """Return the next profile that has arrived by the arm's present time; None without one."""
@@ -61,7 +61,7 @@ def profiler_simulated(
     return SimulatedProfiler(sensor, robot, seed, ProfilerTruth(params.behind))
 
 
-class LookBehind:
+class BeadProfiler:
     """Measures the true bead, independently of the controller's estimate."""
 
     def __init__(self, truth: ProfilerTruth, rng: np.random.Generator) -> None:

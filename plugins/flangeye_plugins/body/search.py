@@ -218,7 +218,7 @@ def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice
     return slice(low[0], high[0]), slice(low[1], high[1])
 
 
-def guesses(view: CoarseImage, looks: Looks, most: int) -> Floats:
+def candidate_poses(view: CoarseImage, looks: Looks, most: int) -> Floats:
     """Return up to ``most`` poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
     rng = np.random.default_rng(2)
     scan = view.edges(looks.size)
@@ -325,7 +325,7 @@ class BodySearch:
         """Return distinct candidate poses of the body, best first."""
         # Coarse cells have less noise
         view = view_of(self.points, self.looks.size / 60)
-        poses = guesses(view, self.looks, 1000)
+        poses = candidate_poses(view, self.looks, 1000)
         # Points of the body that settle them, how far from the body the scan is taken for
         # it, move by move, and how far off it may be where it is judged, as shares of the
         # size, and how many are kept

@@ -286,16 +286,16 @@ def fit_of(session: RecordedSession) -> VariantFits:
     return fit(equations_of(session))
 
 
-def called(arms: Arms) -> str:
+def arm_name(arms: Arms) -> str:
     """Return the name of one of two arms, or both, in messages."""
     return "both arms" if arms == "both" else f"the {arms} arm"
 
 
-def named(arms: Arms, session: RecordedSession) -> str:
-    """Return a text that names the arm whose poses are concerned."""
+def arm_possessive(arms: Arms, session: RecordedSession) -> str:
+    """Return the arms whose poses are concerned, such as ``the first arm's``."""
     if session.seconds is None:
         return "the robot's"
-    return called(arms) + ("'" if arms == "both" else "'s")
+    return arm_name(arms) + ("'" if arms == "both" else "'s")
 
 
 HELPS = 0.7

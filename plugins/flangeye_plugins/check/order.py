@@ -25,8 +25,8 @@ from flangeye_plugins.check.equations import equations_of
 from flangeye_plugins.check.fitting import (
     Significance,
     VariantFits,
+    arm_name,
     best_of,
-    called,
     exceedance,
     fit,
     fit_of,
@@ -82,7 +82,7 @@ def order(session: RecordedSession) -> Findings:
 def _said(session: RecordedSession, arms: Arms, by: int, start: int) -> str:
     which = "later" if by > 0 else "earlier"
     since = f" from '{session.ids[start]}' on" if start else ""
-    of = "" if session.seconds is None else f" of {called(arms)}"
+    of = "" if session.seconds is None else f" of {arm_name(arms)}"
     return f"each scan belongs to the pose{of} {abs(by)} {which}{since}"
 
 
@@ -148,7 +148,7 @@ def clock(session: RecordedSession) -> Findings:
         return
     delay = float(near[finer.which])
     which = "after" if delay > 0 else "before"
-    whose = "the arm was" if session.seconds is None else f"{called(arms)} was"
+    whose = "the arm was" if session.seconds is None else f"{arm_name(arms)} was"
     what = f"{whose} at the scans' poses {abs(delay) * 1e3:.0f} ms {which} they were recorded"
     corrected_session = others[finer.which].session.where(others[finer.which].known)
     if not helps(session.where(others[finer.which].known), corrected_session):

@@ -30,7 +30,15 @@ from flangeye.workflow.doctor.diagnosis import (
     RecordedSession,
 )
 from flangeye_plugins.check.equations import equations_of
-from flangeye_plugins.check.fitting import best_of, explained, fit, fit_of, helps, named, pairs_of
+from flangeye_plugins.check.fitting import (
+    arm_possessive,
+    best_of,
+    explained,
+    fit,
+    fit_of,
+    helps,
+    pairs_of,
+)
 
 _WAYS: Mapping[str, tuple[Change, str]] = {
     "inverted": (
@@ -111,7 +119,7 @@ def _params(session: RecordedSession, of: str | None = None) -> Mapping[str, Any
 
 def _of_arms(session: RecordedSession) -> Iterator[Reread]:
     for arms in session.arms:
-        whose = "the" if session.seconds is None else named(arms, session)
+        whose = "the" if session.seconds is None else arm_possessive(arms, session)
         for read_as, written_as in _readings(_stated(session)):
             reread_session = session.corrected(
                 _rereading(read_as, written_as), arms, robot={"rotation": [read_as, written_as]}
@@ -301,7 +309,7 @@ def _distances(session: RecordedSession) -> tuple[float, float]:
 
 def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
     for arms in session.arms:
-        whose = "the" if session.seconds is None else named(arms, session)
+        whose = "the" if session.seconds is None else arm_possessive(arms, session)
         for way, (change, _) in _WAYS.items():
             yield session.corrected(change, arms, robot={way: True}), whose, way
 

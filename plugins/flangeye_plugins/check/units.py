@@ -23,13 +23,13 @@ from flangeye_plugins.check.fitting import (
     HELPS,
     Significance,
     VariantFits,
+    arm_possessive,
     best_of,
     exceedance,
     explained,
     fit,
     fit_of,
     helps,
-    named,
     size_by_chance,
 )
 
@@ -116,7 +116,7 @@ def _finding(session: RecordedSession, found: OtherUnit, evidence: Significance)
     said, meant = found.said, found.meant
     if found.arms is None or (found.arms == "both" and _rather_target(session, said, meant)):
         return _of_targets_unit(session, found, evidence)
-    whose = named(found.arms, session)
+    whose = arm_possessive(found.arms, session)
     factor = METRES[meant] / METRES[said]
     what = f"{whose} positions were read in {said} and are in {meant} (a factor of {factor:.6g})"
     return _refitted(what, found.session, evidence)

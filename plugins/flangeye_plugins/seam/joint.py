@@ -59,7 +59,7 @@ class JointParams(SeamParams):
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundJoint:
     """A joint found in a scan, in ``camera``.
 
     Attributes:
@@ -86,7 +86,7 @@ class Found:
         s = self.local[:, 0]
         return self.local[(s > self.ends[0]) & (s < self.ends[1])]
 
-    def along_fit(self, points: Floats, reach: float) -> Found:
+    def along_fit(self, points: Floats, reach: float) -> FoundJoint:
         """Return the joint with points in local coordinates of frames along the fitted line."""
         line = self.course.moved(*self.swept.spline.at(self.course.s).T)
         flat = Spline.through(line.length, line.closed, line.s, np.zeros((len(line.s), 3)))
@@ -175,7 +175,7 @@ def _rough(seen: PlacedScan, params: JointParams, seam: Seam | None) -> Curve:
     return course(line, seen.eyes, params.closed, params.reach)
 
 
-def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> Found:
+def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> FoundJoint:
     """Return the fitted joint with its ends."""
     # The seam may be off by `reach`, and its faces are fitted over WIDE; 10 mm are for the line's
     # bends.
@@ -197,7 +197,7 @@ def _found(seen: PlacedScan, rough: Curve, params: JointParams) -> Found:
     # The fit is local: it starts from the places that the search found.
     swept = swept_from(_placed(line, local, normals[at], params), line.length, line.closed)
     rays = Rays(seen.eyes, seen.clouds, line.points)
-    found = Found(line, swept, local, pitch, rays, (0.0, line.length))
+    found = FoundJoint(line, swept, local, pitch, rays, (0.0, line.length))
     # The second and third time along the line that the first has found
     refits = 3
     for k in range(refits):
@@ -253,7 +253,7 @@ def _between(first: list[JointPlace], second: list[JointPlace]) -> float:
     return float(np.median(distances_to_line(np.array([[p.s, *p.q] for p in second]), line)))
 
 
-def _with_ends(found: Found) -> Found:
+def _with_ends(found: FoundJoint) -> FoundJoint:
     """Return the joint with its ends; it ends where the first of its surfaces ends."""
     if found.course.closed:
         return replace(found, ends=(0.0, found.course.length), deviations=(0.0, 0.0))
@@ -261,7 +261,7 @@ def _with_ends(found: Found) -> Found:
     return replace(found, ends=(start[0], stop[0]), deviations=(start[1], stop[1]))
 
 
-def _end(found: Found, sign: int) -> tuple[float, float]:
+def _end(found: FoundJoint, sign: int) -> tuple[float, float]:
     """Return the start (-1) or end (1) of the joint along its course, and its deviation [m].
 
     The deviation is infinite if the joint continues to the course's end.
@@ -291,7 +291,7 @@ def _end(found: Found, sign: int) -> tuple[float, float]:
     return sign * place, float(np.hypot(deviation, 0.5 * pitch))
 
 
-def _line(found: Found) -> tuple[Floats, Floats, Floats]:
+def _line(found: FoundJoint) -> tuple[Floats, Floats, Floats]:
     """Return the seam's points (N, 3), openings (N, 3) and covariances (N, 3, 3) in ``camera``."""
     start, stop = found.ends
     count = max(2, round((stop - start) / SPACING) + 1)
@@ -325,7 +325,7 @@ def _half_width(swept: Sweep) -> float | None:
     return float(np.mean(np.abs(np.array(ends) @ aside))) if len(ends) == 2 else None
 
 
-def _judged(found: Found, params: JointParams) -> dict[str, float]:
+def _judged(found: FoundJoint, params: JointParams) -> dict[str, float]:
     """Return the quality figures of the seam, or refuse it.
 
     Raises:
@@ -385,7 +385,7 @@ def _judged(found: Found, params: JointParams) -> dict[str, float]:
     }
 
 
-def _refuse_plane(found: Found) -> None:
+def _refuse_plane(found: FoundJoint) -> None:
     """Refuse a joint that a plane explains as well, and a gap between coplanar plates not seen."""
     section, pitch, tolerance = found.swept.section, found.pitch, 5 * found.swept.sigma
     q = found.swept.in_section(found.inside)
@@ -411,7 +411,7 @@ def _refuse_plane(found: Found) -> None:
         )
 
 
-def _shares(found: Found) -> tuple[float, float, tuple[float, float] | None]:
+def _shares(found: FoundJoint) -> tuple[float, float, tuple[float, float] | None]:
     """Return the share of points near the seam that are on the joint, the visible share, and a gap.
 
     The visible share is that of the seam's length. The gap is the longest interval in which most
@@ -449,7 +449,7 @@ def _longest_run(flags: NDArray[np.bool_]) -> slice:
     return slice(int(starts[k]), int(stops[k]))
 
 
-def _notes(found: Found, params: JointParams) -> tuple[str, ...]:
+def _notes(found: FoundJoint, params: JointParams) -> tuple[str, ...]:
     open_ends = [
         name
         for name, value in zip(("start", "end"), found.deviations, strict=True)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from flangeye.workflow.batch import cluster
-from flangeye.workflow.batch.cluster import Pace
+from flangeye.workflow.batch.cluster import ChunkPacer
 from flangeye.workflow.batch.dataset import FILE_SESSIONS
 from flangeye.workflow.batch.outcome import SessionOutcome, Status
 from flangeye.workflow.batch.work import Chunk, ChunkDone
@@ -71,7 +71,7 @@ def told(seconds: float, count: int = 10) -> ChunkDone:
 )
 def test_a_chunk_is_some_seconds_of_work(seconds: float, workers: int, size: int) -> None:
     client: Any = Workers(workers)
-    pace = Pace(client, 20_000)
+    pace = ChunkPacer(client, 20_000)
     assert pace.size() == 1  # until it is known how long a session takes
     pace.ended(told(seconds))
     assert pace.size() == size
@@ -79,7 +79,7 @@ def test_a_chunk_is_some_seconds_of_work(seconds: float, workers: int, size: int
 
 def test_chunks_get_shorter_towards_the_end_and_keep_to_their_block() -> None:
     client: Any = Workers(2)
-    pace = Pace(client, FILE_SESSIONS + 100)
+    pace = ChunkPacer(client, FILE_SESSIONS + 100)
     pace.ended(told(0.001))
     chunks: list[Chunk] = list(pace.cut(sessions(FILE_SESSIONS + 100)))
     assert [chunk.block for chunk in chunks] == sorted(chunk.block for chunk in chunks)
@@ -100,4 +100,4 @@ def test_the_scheduler_knows_of_a_little_work(
     own: bool, chunks: int, length: int, asks: bool
 ) -> None:
     client: Any = Workers(2, "ours" if own else None)
-    assert Pace(client, 1000).asks(chunks, chunks * length) == asks
+    assert ChunkPacer(client, 1000).asks(chunks, chunks * length) == asks

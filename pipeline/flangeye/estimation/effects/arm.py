@@ -194,7 +194,7 @@ def _field_block(problem: Problem, linear: Linear, frame: str, field: SmoothFiel
 @lru_cache(maxsize=16)
 def displacements(carrier: Carrier) -> dict[str, Floats]:
     """Return (T, 6, K) twists of the carried frame, in the arm's base about its origin, by kind."""
-    arm, joints = known(carrier)
+    arm, joints = kinematics_and_joints(carrier)
     link = carrier.link
     columns = arm.jacobian(joints, link)
     waves = np.stack([np.sin(joints), np.cos(joints)], axis=1)
@@ -221,7 +221,7 @@ def _levers(arm: Arm, joints: Floats) -> Floats:
     return np.asarray(np.cross(axes, np.stack(beyond, axis=1)) @ np.array([0.0, 0.0, 1.0]))
 
 
-def known(carrier: Carrier) -> tuple[Arm, Floats]:
+def kinematics_and_joints(carrier: Carrier) -> tuple[Arm, Floats]:
     """Return kinematics and joints of a carrier that has both.
 
     Raises:

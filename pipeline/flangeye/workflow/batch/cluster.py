@@ -249,7 +249,7 @@ def worker_count(client: Client) -> int:
     return len(client.scheduler_info(n_workers=-1)["workers"])
 
 
-class Pace:
+class ChunkPacer:
     """Decides how many sessions to submit ahead, and how many form a chunk.
 
     A chunk is some seconds of work, so that overheads are negligible, and less towards the end, so
@@ -316,7 +316,7 @@ def run_all(
     """
     from distributed import as_completed
 
-    pace = Pace(client, count)
+    pace = ChunkPacer(client, count)
     again: list[Chunk] = []
     chunks = pace.cut(sessions)
     waiting: dict[str, Chunk] = {}

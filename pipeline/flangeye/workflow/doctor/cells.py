@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import FlangeyeError, StageError
-from flangeye.estimation.plan import rough
+from flangeye.estimation.plan import preview
 from flangeye.estimation.sightings import problem_of
 from flangeye.files.recording import Archive, Recording
 from flangeye.files.yaml_lines import dumped, parse_yaml
@@ -366,7 +366,7 @@ def _mispaired(session: CellSession) -> list[Finding]:
     """Return the observations that contradict their poses, if the others agree."""
     observations = session.observations
     try:
-        found = rough(problem_of(observations, session.cell), session.cell.freedoms)
+        found = preview(problem_of(observations, session.cell), session.cell.freedoms)
     except (FlangeyeError, np.linalg.LinAlgError):
         return []
     errors = np.linalg.norm(found.errors[:, 3:], axis=1)
@@ -417,7 +417,7 @@ def predicted(session: CellSession, search: bool = True) -> CellPrediction:
     """Return each sighting's error as predicted by the others; infinite without a solution."""
     observations = session.observations
     try:
-        found = rough(problem_of(observations, session.cell), session.cell.freedoms, search)
+        found = preview(problem_of(observations, session.cell), session.cell.freedoms, search)
     except (FlangeyeError, np.linalg.LinAlgError):
         return CellPrediction(Misfit(np.inf), np.inf)
     turns, places = (np.linalg.norm(found.errors[:, at], axis=1) for at in (slice(3), slice(3, 6)))
