@@ -136,8 +136,9 @@ def corrected_view(
 def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm | None) -> Floats:
     """Return the (4, 4) pose to command so that the corrected arm reaches a pose.
 
-    The inverse of :func:`corrected_flange` without the circle's place on the flange, by repeated
-    substitution: a correction changes little over its own size.
+    It is the inverse of :func:`corrected_flange`, without the circle's place on the flange. It is
+    found by repeated substitution, which converges because a correction hardly changes over its own
+    size.
 
     Args:
         base_T_flange: (4, 4) true pose that the flange shall reach.

@@ -136,7 +136,8 @@ class Reach:
     def middle(self) -> Floats:
         """Return (3,) the place on the camera's axis to work at, in ``base`` [m].
 
-        At its working distance; of a body, the nearest place to that where it is shown.
+        It is at the working distance. For a body it is the nearest place to that at which the arm
+        can show the body.
         """
         scanner, base_T_camera = self._scanner, self._base_T_camera
         usual = middle_of_view(scanner, base_T_camera)

@@ -44,11 +44,11 @@ class SimulatedFingerParams(LaidParams):
     """What is true and differs from the controller's files: arm, tool, finger, clock, workpiece,
     heat. One of data/worlds, or a .yaml file."""
     hidden: tuple[Duration, Duration] | None = param(None)
-    """The tag is out of sight from the first time to the second."""
+    """Start and end of the time in which the tag is hidden."""
     held: bool = False
     """To calibrate: the tip stays where it first touches, as in a punch mark."""
     fails: Duration | None = param(None)
-    """When the camera is lost."""
+    """Time at which the camera is lost."""
 
 
 class SimulatedFinger(Device):

@@ -26,13 +26,13 @@ class WeldPrior(Model):
 
     finger: str
     ahead: Length
-    """The tip is ahead of where the finger's file has it."""
+    """Distance of the tip ahead of its place in the finger's file."""
     ahead_sigma: Length = param(gt=0)
     play: Length
     """Half the width of play and hysteresis."""
     play_sigma: Length = param(gt=0)
     stamp: Duration
-    """The images' timestamps are late."""
+    """Delay of the images' timestamps."""
     stamp_sigma: Duration = param(gt=0)
 
 
