@@ -337,7 +337,7 @@ def test_long_chains_take_time_with_their_length_and_messages_stay_short(
         assert max(len(str(words)) for words in told) < 600
         return run
 
-    short, long = steps(1000), steps(16_000)
+    short, long = steps(250), steps(4_000)
     assert long < 16 * 1.5 * short
 
 
