@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import radians, remainder, tau
+from math import remainder, tau
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,54 +122,51 @@ def _places(
     s: float, q: Floats, lines: list[Line], joint: JointShape, tolerance: float, reach: float
 ) -> Iterator[JointPlace]:
     """Yield the places in a slab where lines fit the joint's half-planes."""
-    present = [k for k in range(4) if joint.present[k]]
     beside = {
         k: [_ends(line, k == 1) if k in joint.unseen else [] for line in lines]
         for k in EDGES
-        if k in present
+        if k in joint.planes
     }
     for i, j in product(range(len(lines)), repeat=2):
         faces = {0: i, 2: j}
         if not _agree(joint, [0, 2], [lines[i], lines[j]]):
             continue
         choices = [
-            [lines[faces[k]]] if k in FACES else lines + beside[k][faces[k - 1]] for k in present
+            [lines[faces[k]]] if k in FACES else lines + beside[k][faces[k - 1]]
+            for k in joint.planes
         ]
         for chosen in product(*choices):
-            if _agree(joint, present, chosen):
-                place = _placed(s, q, joint, present, chosen, tolerance)
-                if place is not None and np.abs(place.q).max() <= reach:
+            if _agree(joint, joint.planes, chosen):
+                place = _placed(s, q, joint, chosen, tolerance, reach)
+                if place is not None:
                     yield place
 
 
 def _agree(joint: JointShape, which: list[int], lines: tuple[Line, ...] | list[Line]) -> bool:
     """Return whether the angles between lines agree with those between the joint's half-planes."""
-    off = [line.angle - radians(joint.angles[k]) for line, k in zip(lines, which, strict=True)]
-    allowed = [radians(2 * joint.spread[k] + 4) for k in which]
+    turns = [joint.turns[k] for k in which]
+    off = [line.angle - nominal for line, (nominal, _) in zip(lines, turns, strict=True)]
+    first = turns[0][1]
     return all(
-        abs(remainder(o - off[0], tau)) <= a + allowed[0] for o, a in zip(off, allowed, strict=True)
+        abs(remainder(o - off[0], tau)) <= allowed + first
+        for o, (_, allowed) in zip(off, turns, strict=True)
     )
 
 
 def _placed(
-    s: float,
-    q: Floats,
-    joint: JointShape,
-    present: list[int],
-    lines: tuple[Line, ...],
-    tolerance: float,
+    s: float, q: Floats, joint: JointShape, lines: tuple[Line, ...], tolerance: float, reach: float
 ) -> JointPlace | None:
-    """Return the joint whose half-planes are these lines; None if it is not plausible."""
-    nominal, spread = (np.radians([x[k] for k in present]) for x in (joint.angles, joint.spread))
+    """Return the joint whose half-planes are these lines; None if not plausible, or too far."""
+    nominal, spread = joint.nominal
     off = np.array([line.angle for line in lines]) - nominal
     weights = 1 / spread**2
     # Weighted circular mean, because angles wrap
     roll = float(np.angle(weights @ np.exp(1j * off)))
     angles = np.full(4, 0.0)
-    angles[present] = np.angle(np.exp(1j * (off - roll)))
-    turned = roll + nominal + angles[present]
+    angles[joint.planes] = np.angle(np.exp(1j * (off - roll)))
+    turned = roll + nominal + angles[joint.planes]
     heights = joint.free[4:]
-    design = np.column_stack([np.sin(turned), np.cos(turned), OFFSETS[present][:, heights]])
+    design = np.column_stack([np.sin(turned), np.cos(turned), OFFSETS[joint.planes][:, heights]])
     # The ridge sets heights that the lines do not determine to zero
     ridge = 1e-6 * np.eye(design.shape[1])
     solved = np.linalg.solve(
@@ -179,6 +176,8 @@ def _placed(
     lengths[heights] = solved[2:]
     # Plates cannot overlap, and a butt joint needs a gap that is seen.
     if not (lengths >= -tolerance).all() or (joint.gap and lengths[2] < 2 * tolerance / 3):
+        return None
+    if np.abs(solved[:2]).max() > reach:
         return None
     section = Section(joint, np.concatenate([angles, np.maximum(lengths, 0.0)]))
     score = explained(section, turn(q - solved[:2], roll), tolerance)
@@ -204,10 +203,8 @@ def explained(section: Section, q: Floats, tolerance: float) -> float | None:
     near = np.linalg.norm(q, axis=1) < around + section.shape[4:6].max()
     good = near & (np.abs(away) < tolerance)
     counts = np.bincount(active[good], minlength=4)
-    needed = [k for k in FACES if section.joint.present[k]]
-    needed += [k for k in EDGES if section.joint.present[k] and k not in section.joint.unseen]
     of = int(near.sum())
-    if counts[needed].min() < max(12, 0.04 * of):
+    if counts[section.joint.shown].min() < max(12, 0.04 * of):
         return None
     # From -1 to 1: each unexplained point costs what an explained one gains.
     return float(2 * good.sum() / max(of, 1) - 1)

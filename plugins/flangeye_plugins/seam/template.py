@@ -9,6 +9,8 @@ its face and its edge, and the joint is the union of both plates. So its boundar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +43,34 @@ class JointShape:
     gap: bool = False
     unseen: tuple[int, ...] = ()
 
-    @property
+    @cached_property
     def present(self) -> Mask:
         """Mask (4,) of the half-planes that exist."""
         return np.isfinite(self.angles)
 
-    @property
+    @cached_property
+    def planes(self) -> list[int]:
+        """Indices of the half-planes that exist."""
+        return [k for k in range(4) if self.present[k]]
+
+    @cached_property
+    def shown(self) -> list[int]:
+        """Indices of the half-planes that points must show: faces, and edges that are seen."""
+        return [k for k in self.planes if k in FACES or k not in self.unseen]
+
+    @cached_property
+    def turns(self) -> list[tuple[float, float]]:
+        """Nominal angle of each half-plane, and how far a line may be off it [rad]."""
+        both = zip(self.angles, self.spread, strict=True)
+        return [(radians(angle), radians(2 * spread + 4)) for angle, spread in both]
+
+    @cached_property
+    def nominal(self) -> tuple[Floats, Floats]:
+        """Angles of the half-planes that exist, and their standard deviations [rad]."""
+        angles, spread = (np.array(each)[self.planes] for each in (self.angles, self.spread))
+        return np.radians(angles), np.radians(spread)
+
+    @cached_property
     def free(self) -> Mask:
         """Mask (7,) of the shape's numbers that are estimated: angles, heights, gap."""
         return np.concatenate([self.present, [*self.heights, self.gap]])
@@ -134,7 +158,8 @@ class Section:
 
     def distances(self, q: Floats) -> tuple[Floats, NDArray[np.intp]]:
         """Return signed distances (N,) of points (N, 2) [m], and the nearest half-planes (N,)."""
-        away = q @ np.nan_to_num(self.normals).T - self.heights
+        normals = np.where(self.joint.present[:, None], self.normals, 0.0)
+        away = q @ normals.T - self.heights
         away[:, ~self.joint.present] = -np.inf
         # A plate is where both of its half-planes are, the larger distance; the work is where
         # either plate is, the smaller one
