@@ -6,7 +6,6 @@ Poses are (N, 4, 4) ``base_T_flange`` [m], in the order they were recorded.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,25 +111,22 @@ def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
         times: (N,) of the poses, rising [s].
         delay: Negative for earlier [s].
     """
-    return delaying(poses, times)(delay)
+    moved, kept = delayed_by_each(poses, times, np.array([delay]))
+    return moved[0], kept[0]
 
 
-def delaying(poses: Floats, times: Floats) -> Callable[[float], tuple[Floats, Mask]]:
-    """Return a function like :func:`delayed` that is fast for many delays."""
+def delayed_by_each(poses: Floats, times: Floats, delays: Floats) -> tuple[Floats, Mask]:
+    """Return poses (K, N, 4, 4) and masks (K, N) as :func:`delayed` does, for K delays at once."""
     from scipy.spatial.transform import Rotation, Slerp
 
-    turning = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))
-
-    def later(delay: float) -> tuple[Floats, Mask]:
-        wanted = times + delay
-        kept = (wanted >= times[0]) & (wanted <= times[-1])
-        inside = np.clip(wanted, times[0], times[-1])
-        out = np.array(poses)
-        out[:, :3, :3] = turning(inside).as_matrix()
-        out[:, :3, 3] = rows_at(inside, times, poses[:, :3, 3])
-        return out, np.asarray(kept)
-
-    return later
+    wanted = times + delays[:, None]
+    kept = (wanted >= times[0]) & (wanted <= times[-1])
+    inside = np.clip(wanted, times[0], times[-1])
+    out = np.tile(poses, (len(delays), 1, 1, 1))
+    turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside.ravel()).as_matrix()
+    out[..., :3, :3] = turns.reshape(*inside.shape, 3, 3)
+    out[..., :3, 3] = rows_at(inside, times, poses[:, :3, 3])
+    return out, np.asarray(kept)
 
 
 def without_tool(poses: Floats, offset: Floats) -> Floats:

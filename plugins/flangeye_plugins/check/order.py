@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import part
-from flangeye.maths.pose_corrections import delaying, shifted, without_tool
+from flangeye.maths.pose_corrections import delayed_by_each, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Indices, Mask
 from flangeye.types.geometry import rigid, rotation_exp
@@ -38,8 +39,6 @@ from flangeye_plugins.check.fitting import (
 
 Change = Callable[[Floats], tuple[Floats, Mask]]
 """Gives poses (N, 4, 4), and the samples (N,) that have one."""
-Later = Callable[[float], tuple[Floats, Mask]]
-"""Gives an arm's poses after a delay [s], and the samples that have one."""
 
 
 class Reordered(NamedTuple):
@@ -157,26 +156,23 @@ def clock(session: RecordedSession) -> Findings:
 
 
 def _delays(session: RecordedSession, delays: Floats, arms: Sequence[Arms]) -> list[Reordered]:
-    made: dict[int, Later] = {}
+    made: dict[int, tuple[Floats, Mask]] = {}
 
-    def later_of(poses: Floats) -> Later:
+    def at_another_time(poses: Floats, k: int) -> tuple[Floats, Mask]:
+        if session.motions is not None and poses is session.poses:
+            delay = float(delays[k])
+            known = np.array([later(each, delay) is not None for each in session.motions])
+            return np.array([pose_at(each, delay) for each in session.motions]), known
         if id(poses) not in made:
-            made[id(poses)] = delaying(poses, session.times)
-        return made[id(poses)]
+            made[id(poses)] = delayed_by_each(poses, session.times, delays)
+        moved, kept = made[id(poses)]
+        return moved[k], kept[k]
 
-    return [_delayed(session, later_of, each, float(delay)) for each in arms for delay in delays]
-
-
-def _delayed(
-    session: RecordedSession, later_of: Callable[[Floats], Later], arms: Arms, delay: float
-) -> Reordered:
-    def change(poses: Floats) -> tuple[Floats, Mask]:
-        if session.motions is None or poses is not session.poses:
-            return later_of(poses)(delay)
-        known = np.array([later(each, delay) is not None for each in session.motions])
-        return np.array([pose_at(each, delay) for each in session.motions]), known
-
-    return _at_other_times(session, change, arms, delay=f"{delay * 1e3:.1f} ms")
+    return [
+        _at_other_times(session, partial(at_another_time, k=k), arm, delay=f"{delay * 1e3:.1f} ms")
+        for arm in arms
+        for k, delay in enumerate(delays)
+    ]
 
 
 def _evidence(
