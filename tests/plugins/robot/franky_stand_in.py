@@ -37,7 +37,7 @@ class StandIn:
         self.arm.set_tool(self._tool)
         self._mover = Mover(self.arm)
         self.mode, self.trouble, self.gone = "Idle", None, None
-        self.moves = []
+        self.moves, self.waits = [], []
 
     joint_velocity_limit = SimpleNamespace(get=lambda: np.full(7, JOINT_SPEED))
     joint_acceleration_limit = SimpleNamespace(get=lambda: np.full(7, JOINT_ACCELERATION))
@@ -64,6 +64,7 @@ class StandIn:
         return self._mover.busy
 
     def join_motion(self, timeout):
+        self.waits.append(timeout)
         for _ in range(round(timeout / 0.001)):
             self._mover.step()
         return not self._mover.busy

@@ -222,6 +222,7 @@ def test_a_motion_of_another_kind_waits_for_the_stop(robot: Any, connection: Sta
         robot.state()
     robot.move_joints(start.joints, 0.2, 1.0)
     assert connection.moves == ["CartesianMotion", "CartesianStopMotion", "JointMotion"]
+    assert connection.waits == [1.0]  # [s]
     np.testing.assert_allclose(settle(robot).joints, start.joints, atol=1e-9)
 
 
