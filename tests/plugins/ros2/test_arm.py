@@ -14,6 +14,7 @@ from flangeye.devices import DeviceError
 from flangeye.maths.kinematics import Arm
 from flangeye.models.graph import Topic
 from flangeye.models.loading import load_model
+from flangeye.models.robots import RobotModel
 from flangeye_plugins.robot.ros2.driver import (
     FreedriveParams,
     Ros2RobotParams,
@@ -128,8 +129,8 @@ def graph(monkeypatch: pytest.MonkeyPatch) -> Graph:
     return put_in(Graph(), monkeypatch)
 
 
-def opened(topic: str = TOPIC, joints: tuple[str, ...] = JOINTS) -> Any:
-    return robot_ros2.function(ARM, Ros2RobotParams(joints=joints, trajectory=topic))
+def opened(topic: str = TOPIC, joints: tuple[str, ...] = JOINTS, model: RobotModel = ARM) -> Any:
+    return robot_ros2.function(model, Ros2RobotParams(joints=joints, trajectory=topic))
 
 
 def refused(why: str) -> Any:
@@ -239,6 +240,22 @@ def test_a_controller_that_rejects_what_it_is_given_is_noticed_after_less_than_a
         assert 0.8 < graph.now - began < 0.84
 
 
+@pytest.mark.parametrize(("by", "moves"), [(1.1e-3, True), (0.9e-3, False)])
+def test_an_arm_has_moved_when_a_joint_turned_by_a_thousandth_of_a_radian(
+    graph: Graph, by: float, moves: bool
+) -> None:
+    with opened() as arm:
+        began = graph.now
+        arm.move_joints(graph.joints + 0.5, 0.5, 1.0)
+        for _ in range(200):
+            arm.wait_cycle()
+        graph.joints = graph.joints - by * np.eye(6)[2]
+        with refused("ur5e on /joint_states: /controller/joint_trajectory was given trajectories"):
+            while True:
+                arm.wait_cycle()
+        assert graph.now - began == pytest.approx(1.2 if moves else 0.8, abs=0.06)
+
+
 @pytest.mark.parametrize(("late", "pieces"), [(0.146, 2), (0.15, 1)])
 def test_a_motion_that_was_not_renewed_in_time_is_not_resumed(
     graph: Graph, late: float, pieces: int
@@ -301,6 +318,71 @@ def test_a_velocity_that_is_asked_for_again_goes_on(graph: Graph) -> None:
         speeds = np.array(graph.published[-1][1].points[-2].velocities)
         flange = Arm(ARM).jacobian(graph.joints) @ speeds
         assert flange[5] < 0.0
+
+
+@pytest.mark.parametrize(("robot", "stretched"), [("ur10e", True), ("ur5e", False)])
+def test_a_velocity_speeds_the_joints_up_by_the_acceleration_at_a_lever_of_a_metre_or_more(
+    graph: Graph, robot: str, stretched: bool
+) -> None:
+    model = load_model("robots", robot)
+    if stretched:
+        graph.joints = np.array([0.0, 0.0, 0.0, -1.57, -1.57, 0.0])
+    lever = float(np.linalg.norm(Arm(model).jacobian(graph.joints)[3:], axis=0).max())
+    assert lever > 1.2 if stretched else lever < 0.95
+    with opened(model=model) as arm:
+        twist = np.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+        for _ in range(50):
+            arm.move_velocity(twist, 0.5)
+            arm.wait_cycle()
+    speeds = [np.abs(piece.points[-2].velocities).max() for _, piece in graph.published[1:]]
+    ends = [piece.header.stamp.sec + 1e-9 * piece.header.stamp.nanosec
+            for _, piece in graph.published[1:]]  # fmt: skip
+    assert np.diff(speeds)[:2] / np.diff(ends)[:2] == pytest.approx(0.5 / max(lever, 1.0))
+
+
+def test_a_piece_s_points_have_places_and_speeds_alone(graph: Graph) -> None:
+    with opened() as arm:
+        arm.move_joints(graph.joints + 0.5, 0.5, 1.0)
+    points = [point for _, piece in graph.published for point in piece.points]
+    assert {(len(p.positions), len(p.velocities)) for p in points} == {(6, 6)}
+    assert {(len(p.accelerations), len(p.effort)) for p in points} == {(0, 0)}
+
+
+def test_an_arm_that_was_stopped_moves_until_stop_and_controller_had_their_time(
+    graph: Graph,
+) -> None:
+    with opened() as arm:
+        assert ready_after(graph, arm) == 0.0
+        arm.move_joints(graph.joints + 0.5, 0.5, 1.0)
+        arm.stop()
+        assert ready_after(graph, arm) == pytest.approx(0.2 + 0.3, abs=0.0021)
+
+
+def test_an_arm_that_has_come_to_its_goal_is_ready_0_33_s_after_its_last_piece(
+    graph: Graph,
+) -> None:
+    with opened() as arm:
+        goal = graph.joints + 0.04
+        arm.move_joints(goal, 0.5, 1.0)  # takes half a second, smoothed
+        graph.joints = goal
+        assert ready_after(graph, arm) == pytest.approx(0.5 + 0.33, abs=0.01)
+    assert graph.published[-1][1].points[-1].positions == pytest.approx(goal)
+
+
+@pytest.mark.parametrize(("moves", "closed"), [(False, False), (True, True), (True, False)])
+def test_only_an_arm_that_moves_is_stopped_at_the_end_while_its_bridge_is_there(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch, moves: bool, closed: bool
+) -> None:
+    asked: list[str] = []
+    arm = opened()
+    if moves:
+        arm.move_joints(graph.joints + 0.5, 0.5, 1.0)
+    count, graph.closed = len(graph.published), closed
+    monkeypatch.setattr(graph, "listeners", asked.append)
+    arm.close()
+    stops = moves and not closed
+    assert (len(graph.published) - count, len(asked)) == (int(stops), int(stops))
+    assert graph.closed
 
 
 def ready_after(graph: Graph, arm: Any) -> float:
