@@ -17,7 +17,7 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye_plugins.robot.ur import worker
-from flangeye_plugins.robot.ur.driver import facts_of
+from flangeye_plugins.robot.ur.driver import facts_of, stop
 from tests.emulators.controllers.process import free_address
 
 READY = {
@@ -105,7 +105,9 @@ def test_a_dashboard_that_hangs_up_is_one_line(dashboard: Any) -> None:
     )
 
 
-def test_a_dashboard_is_waited_for_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dashboard_is_waited_for_half_a_second_and_in_the_background_a_whole_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tried: list[Any] = []
 
     def create_connection(address: Any, timeout: float) -> Any:
@@ -115,7 +117,11 @@ def test_a_dashboard_is_waited_for_a_second(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(worker, "socket", SimpleNamespace(create_connection=create_connection))
     with pytest.raises(TimeoutError), worker.ask_dashboard("10.0.0.1"):
         pass
-    assert tried == [(("10.0.0.1", 29999), 1.0)]
+    with pytest.raises(DeviceError, match=r"does not answer \(nothing within 0.5 s\)"):
+        facts_of("ur5e", "10.0.0.1")
+    with pytest.raises(TimeoutError):
+        stop("10.0.0.1")
+    assert tried == [(("10.0.0.1", 29999), seconds) for seconds in (1.0, 0.5, 0.5)]
 
 
 class Library:
