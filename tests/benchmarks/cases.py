@@ -300,7 +300,7 @@ def finger() -> tuple[Work, Work]:
 
 
 def cycle() -> tuple[Work, Work]:
-    """A cycle of the weld's controller with a new touch in it, the dearest one; 2 ms are allowed."""
+    """A cycle of the weld's controller with a new touch in it, the slowest kind; 2 ms are allowed."""
     from flangeye.motion.seam_following import ToolPose, Touch
     from flangeye_plugins.weld.following.follower import Follower
     from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
