@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.models.bodies import TargetBody
 from flangeye.types import Floats, Indices, Mask
 from flangeye.types.geometry import rotation_exp
-from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, spread_directions
+from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, some_of, spread_directions
 from flangeye_plugins.body.view import CoarseImage
 
 ALIKE, SIMILAR = 0.5, 0.7
@@ -46,6 +46,49 @@ class Symmetry(NamedTuple):
     axis: Floats
 
 
+class EndPairs:
+    """Pairs of ends of a body's faces, to be found by how the two lie to each other."""
+
+    def __init__(self, ends: OrientedPoints, seen: Mask, size: float) -> None:
+        """Take the ends of a body of a ``size`` [m]; ``seen`` (V, N) are those visible at once."""
+        from scipy.spatial import cKDTree
+
+        self._size = size
+        # Number of ends, and their spacing as a share of the size
+        some = some_of(ends, 400, size * (1 / 18), np.random.default_rng(2))
+        visible = seen[:, some].astype(np.float32)
+        pairs = some[np.array(np.nonzero(visible.T @ visible))]
+        self._pairs = pairs[:, self.apart(ends, pairs)]
+        self._tree = cKDTree(self._relation(ends, self._pairs))
+
+    def apart(self, ends: OrientedPoints, pairs: Indices) -> Mask:
+        """Return the mask (N,) of pairs (2, N) that are so far apart that they determine a pose."""
+        way = ends.points[pairs[1]] - ends.points[pairs[0]]
+        return np.asarray(np.linalg.norm(way, axis=1) > 0.2 * self._size)
+
+    def like(self, ends: OrientedPoints, pairs: Indices) -> tuple[Indices, Indices]:
+        """Return the body's pairs (2, M) that are like one of ``pairs`` (2, N), and which (M,)."""
+        # The likest ones, found within a factor of two; three tolerances at most
+        off, at = self._tree.query(
+            self._relation(ends, pairs), k=12, eps=1.0, distance_upper_bound=3.0
+        )
+        of, rank = np.nonzero(np.isfinite(off))
+        return self._pairs[:, at[of, rank]], of
+
+    def _relation(self, ends: OrientedPoints, pairs: Indices) -> Floats:
+        """Return distances and cosines (N, 9) that any motion leaves, in units of a tolerance."""
+        way = ends.points[pairs[1]] - ends.points[pairs[0]]
+        apart = np.linalg.norm(way, axis=1)
+        normals, outwards = ends.normals[pairs], ends.directions[pairs]
+        frames = np.concatenate([normals, outwards, np.cross(normals, outwards)])
+        cosines = [
+            *np.einsum("kni,ni->kn", frames, way / apart[:, None]),
+            *(np.einsum("ni,ni->n", *both) for both in (normals, outwards)),
+        ]
+        # As far off as ends are apart, and as a coarse view's normals turn a cosine
+        return np.column_stack([apart / (0.06 * self._size), *np.array(cosines) / 0.2])
+
+
 class Looks(Shape):
     """A body's shape with its visible part from each of 128 directions."""
 
@@ -78,6 +121,11 @@ class Looks(Shape):
     def ends_seen(self) -> Mask:
         """Mask (V, N) of the edge points visible from each direction."""
         return self._seen[1]
+
+    @cached_property
+    def pairs(self) -> EndPairs:
+        """Pairs of ends that are visible together."""
+        return EndPairs(self.ends, self.ends_seen, self.size)
 
     @cached_property
     def _listed(self) -> tuple[Indices, Indices]:

@@ -1,8 +1,9 @@
 """Find a body in a scan: pose hypotheses, refined and tested against the scanner's rays.
 
-Hypotheses match edges of the body to edges of the scan. At a face's end, its normal and the outward
-direction within the face define a frame. Every such frame of the body is aligned with every one of
-the scan, and comparing a few points of the body rules most of the poses out.
+Hypotheses match pairs of points at the ends of faces. The distance of the two, and the angles
+between the line that joins them, the faces' normals and their outward directions, are alike on the
+body and in the scan; laying one pair on the other gives a pose. Comparing a few points of the body
+rules most poses out. (Drost et al., CVPR 2010, match pairs of surface points.)
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from flangeye.types import Floats, Indices, Mask, Singles
 from flangeye_plugins.body.dense import fitted
 from flangeye_plugins.body.looks import Looks
-from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, thin
+from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, some_of
 from flangeye_plugins.body.view import CoarseImage, view_of
 
 OUTLINE = 3
@@ -218,20 +219,22 @@ def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice
     return slice(low[0], high[0]), slice(low[1], high[1])
 
 
-def candidate_poses(view: CoarseImage, looks: Looks, most: int) -> Floats:
-    """Return up to ``most`` poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan."""
-    rng = np.random.default_rng(2)
-    scan = view.edges(looks.size)
-    # Number and spacing (as a share of the body's size) of the ends that are matched
-    on = scan.take(_some(scan, 800, looks.size * (1 / 22), rng))
-    poses = _passed(on, _some(looks.ends, 400, looks.size * (1 / 18), rng), view, looks)
-    # Poses are refined by one ICP step before 40 points select the best: on a long body the
-    # direction of one edge is too inaccurate
-    at_once, few, reach = 2_000, 16, 0.1 * looks.size
-    chunks = range(0, len(poses), at_once)
-    moved = [looks.settled(poses[k : k + at_once], view, few, reach) for k in chunks]
-    poses = np.concatenate([poses[:0], *moved])
-    return poses[_best_of(looks.scores(poses, view, 40, 0.05), most)].astype(np.float64)
+def candidate_poses(ends: OrientedPoints, some: slice, view: CoarseImage, looks: Looks) -> Floats:
+    """Return up to 500 poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan.
+
+    Args:
+        ends: Ends of surfaces in the scan.
+        some: Which of their pairs are matched, in random order.
+        view: Coarse image of the scan.
+        looks: The body.
+    """
+    poses = _matched(ends, some, looks)
+    # Points that are compared, and tolerance as a share of the size
+    scores = _chunked(poses, partial(looks.scores, view=view, count=16, tolerance=0.05))
+    poses = poses[_best_of(scores, 2_000)]
+    # Poses are refined by one ICP step before 40 points select the best
+    poses = looks.settled(poses, view, 16, 0.1 * looks.size)
+    return poses[_best_of(looks.scores(poses, view, 40, 0.05), 500)].astype(np.float64)
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
@@ -240,53 +243,43 @@ def _best_of(scores: Floats, most: int) -> Indices:
     return every if len(scores) <= most else np.argpartition(-scores, most)[:most]
 
 
-def _passed(on: OrientedPoints, at: Indices, view: CoarseImage, looks: Looks) -> Floats:
-    """Return the best poses that align the body's ends ``at`` with the scan's ends ``on``."""
-    off = looks.ends.take(at)
-    scan, body = _frames(on), _frames(off)
-
-    def posed(number: Indices) -> Floats:
-        reference, anchor = np.divmod(number, max(len(at), 1))
-        out: Floats = np.zeros((len(number), 4, 4), np.float32)
-        out[:, :3, :3], out[:, 3, 3] = scan[reference].transpose(0, 2, 1) @ body[anchor], 1.0
-        moved = np.einsum("nij,nj->ni", out[:, :3, :3], off.points[anchor])
-        out[:, :3, 3] = on.points[reference] - moved
-        return out
-
-    def unhidden(number: Indices) -> Indices:
-        return number[looks.ends_seen[looks.view_of(posed(number)), at[number % max(len(at), 1)]]]
-
-    def scored(number: Indices, count: int) -> Floats:
-        # Tolerance as a share of the size, while the rotation is known to 9 degrees only
-        return looks.scores(posed(number), view, count, 0.06)
-
-    number = _chunked(np.arange(len(scan) * len(body)), unhidden)
-    # Number of the body's points that are compared, and number of poses that pass
-    for count, left in ((4, 30_000), (12, 6_000)):
-        scores = _chunked(number, partial(scored, count=count))
-        number = number[_best_of(scores, left)]
-    return posed(number)
-
-
-def _chunked(number: Indices, work: Callable[[Indices], Any]) -> Any:
-    """Return ``work`` applied to chunks of indices, concatenated."""
+def _chunked(poses: Floats, work: Callable[[Floats], Floats]) -> Floats:
+    """Return ``work`` applied to chunks of poses, concatenated."""
     # Poses per chunk: their points fit in a core's cache
-    at_once = 30_000
-    chunks = range(0, max(len(number), 1), at_once)
-    return np.concatenate([work(number[k : k + at_once]) for k in chunks])
+    chunks = range(0, max(len(poses), 1), 2_000)
+    return np.concatenate([work(poses[k : k + 2_000]) for k in chunks])
 
 
-def _some(points: OrientedPoints, count: int, spacing: float, rng: np.random.Generator) -> Indices:
-    """Return indices of up to ``count`` random points, about ``spacing`` apart [m]."""
-    mixed = rng.permutation(len(points.points))
-    kept = thin(points.points[mixed], points.directions[mixed], spacing)
-    return np.asarray(mixed[rng.permutation(kept)[:count]])
+def _matched(scan: OrientedPoints, some: slice, looks: Looks) -> Floats:
+    """Return the poses (K, 4, 4) that lay a pair of the body's ends on a like pair of the scan's.
+
+    The ends of both lie alike to each other, and the pose shows both of the body's.
+    """
+    from scipy.spatial import cKDTree
+
+    rng = np.random.default_rng(2)
+    scan = scan.take(np.flatnonzero(np.isfinite(scan.directions[:, 0])))
+    # Number of ends, and their spacing as a share of the size
+    scan = scan.take(some_of(scan, 800, looks.size * (1 / 22), rng))
+    pairs = cKDTree(scan.points).query_pairs(looks.size, output_type="ndarray")
+    pairs = rng.permutation(pairs[looks.pairs.apart(scan, pairs.T)])[some].T
+    own, of = looks.pairs.like(scan, pairs)
+    on = pairs[:, of]
+    u, _, vt = np.linalg.svd(_arrows(scan, on).transpose(0, 2, 1) @ _arrows(looks.ends, own))
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    poses: Floats = np.zeros((len(of), 4, 4), np.float32)
+    poses[:, :3, :3], poses[:, 3, 3] = u @ vt, 1.0
+    middle, at = scan.points[on].mean(axis=0), looks.ends.points[own].mean(axis=0)
+    poses[:, :3, 3] = middle - np.einsum("nij,nj->ni", poses[:, :3, :3], at)
+    return poses[looks.ends_seen[looks.view_of(poses), own].all(axis=0)]
 
 
-def _frames(ends: OrientedPoints) -> Floats:
-    """Return the frames of ends (N, 3, 3); rows: normal, outward direction, cross product."""
-    third = np.cross(ends.normals, ends.directions)
-    return np.stack([ends.normals, ends.directions, third], axis=1)
+def _arrows(ends: OrientedPoints, pairs: Indices) -> Floats:
+    """Return the directions (N, 5, 3) of pairs (2, N): of the line between the ends, and theirs."""
+    way = ends.points[pairs[1]] - ends.points[pairs[0]]
+    # Noise turns the line between two ends less than the face at either, by about this factor
+    way *= 3.0 / np.linalg.norm(way, axis=1, keepdims=True)
+    return np.stack([way, *ends.normals[pairs], *ends.directions[pairs]], axis=1)
 
 
 FINE_ACROSS = 100
@@ -316,16 +309,28 @@ class BodySearch:
     Attributes:
         points: (N, 3) points of the scan, at least ``FEWEST``, all in front of the scanner [m].
         looks: The body's shape with its visible parts.
+        passes: Whether a pose is good enough that only poses which explain as much matter beside.
     """
 
     points: Singles
     looks: Looks
+    passes: Callable[[FoundPose], bool]
 
     def everywhere(self) -> list[FoundPose]:
         """Return distinct candidate poses of the body, best first."""
-        # Coarse cells have less noise
-        view = view_of(self.points, self.looks.size / 60)
-        poses = candidate_poses(view, self.looks, 1000)
+        found = self.quickly()
+        if any(map(self.passes, found)):
+            return found
+        # An edge-on plate shows few ends
+        return self._distinct(found + self._among(slice(20_000, 80_000)))
+
+    def quickly(self) -> list[FoundPose]:
+        """Return as ``everywhere``, from as many pairs of ends as most bodies are found by."""
+        return self._among(slice(20_000))
+
+    def _among(self, some: slice) -> list[FoundPose]:
+        """Return the poses found by some of the scan's pairs of ends, in random order."""
+        poses = candidate_poses(self._ends, some, self._coarse, self.looks)
         # Points of the body that settle them, how far from the body the scan is taken for
         # it, move by move, and how far off it may be where it is judged, as shares of the
         # size, and how many are kept
@@ -334,8 +339,8 @@ class BodySearch:
             (160, (0.04, 0.03, 0.02), 0.02, 40),
         ):
             for reach in reaches:
-                poses = self.looks.settled(poses, view, count, reach * self.looks.size)
-            scores = self.looks.scores(poses, view, count, tolerance)
+                poses = self.looks.settled(poses, self._coarse, count, reach * self.looks.size)
+            scores = self.looks.scores(poses, self._coarse, count, tolerance)
             poses = poses[distinct(poses, scores, self.looks)[:left]]
         found = self.near(poses)
         return self._distinct(found + self.near(self._twins(found[0]))) if found else []
@@ -345,9 +350,11 @@ class BodySearch:
         if not len(poses):
             return []
         scores = [judged(self.looks, self._fine, pose, self._rough).rank for pose in poses]
-        # Refined on the scan's own points
         poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
-        return self._distinct([one for one in map(self._laid, poses) if one])
+        best, others = self._laid(poses[0]), poses[1:]
+        if best and self.passes(best):
+            others = self._rivals(others, best)
+        return self._distinct([one for one in (best, *map(self._laid, others)) if one])
 
     def refuted(self, pose: Floats, near: Callable[[Floats], Mask]) -> float:
         """Return the share of a part of the body that the scan contradicts by seeing through it.
@@ -402,6 +409,15 @@ class BodySearch:
         return max(0.003 * self.looks.size, 3.5 * self._fine.noise)
 
     @cached_property
+    def _coarse(self) -> CoarseImage:
+        """The scan in cells as wide as a pose is rough, with less noise than single points."""
+        return view_of(self.points, self.looks.size / 60)
+
+    @cached_property
+    def _ends(self) -> OrientedPoints:
+        return self._coarse.edges(self.looks.size)
+
+    @cached_property
     def _fine(self) -> CoarseImage:
         return view_of(self.points, self.looks.size / FINE_ACROSS)
 
@@ -420,13 +436,17 @@ class BodySearch:
 
     def _twins(self, best: FoundPose) -> Floats:
         """Return the pose, turned by a cube's rotations, where the scan is explained as well."""
-        # A turned pose that explains 40 % of the rays is refined too
-        return self._as_well(self.looks.twins(best.pose), 0.4 * best.verdict.agree)
+        return self._rivals(self.looks.twins(best.pose), best)
+
+    def _rivals(self, poses: Floats, best: FoundPose) -> Floats:
+        """Return the poses, out of (K, 4, 4), that may explain as much as the best one does."""
+        # Refined, a pose may explain more than twice as many rays
+        return self._as_well(poses, 0.4 * best.verdict.agree)
 
     def _as_well(self, poses: Floats, least: float) -> Floats:
         """Return the poses, out of (K, 4, 4), with which more than ``least`` rays agree."""
         agree = [judged(self.looks, self._fine, pose, self._rough).agree for pose in poses]
-        return np.asarray(poses[np.array(agree) > least])
+        return np.asarray(poses[np.array(agree, int) > least])
 
     def _distinct(self, found: list[FoundPose]) -> list[FoundPose]:
         poses = np.array([one.pose for one in found]).reshape(-1, 4, 4)

@@ -283,3 +283,12 @@ def thin(points: Floats, directions: Floats, spacing: float) -> Indices:
     sign = np.take_along_axis(directions, main[:, None], axis=1)[:, 0] > 0
     keys = np.column_stack([place, 2 * main + sign])
     return np.sort(np.unique(keys, axis=0, return_index=True)[1])
+
+
+def some_of(
+    points: OrientedPoints, count: int, spacing: float, rng: np.random.Generator
+) -> Indices:
+    """Return indices of up to ``count`` random points, about ``spacing`` apart [m]."""
+    mixed = rng.permutation(len(points.points))
+    kept = thin(points.points[mixed], points.directions[mixed], spacing)
+    return np.asarray(mixed[rng.permutation(kept)[:count]])

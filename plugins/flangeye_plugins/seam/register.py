@@ -74,7 +74,7 @@ def register(
     # Measured points lie before the scanner; others are invalid.
     scan = points[points[:, 2] > 0.0].astype(np.float32)
     looks = Looks(workpiece.vertices, workpiece.triangles)
-    search = BodySearch(scan, looks)
+    search = BodySearch(scan, looks, lambda one: one.verdict.score > 0 and one.seen >= limits.seen)
     found = [one for one in search.everywhere() if one.verdict.score > 0]
     fit = _laid(scan, looks, found[0].pose) if found else None
     if fit is None:

@@ -94,7 +94,7 @@ def segment_body(
     if looks.symmetry.freedoms == 3:
         return _ball(capture, looks, params)
     _require_axis(body, looks, configuration)
-    search = BodySearch(points, looks)
+    search = BodySearch(points, looks, params.passed_by)
     predicted = _predicted(capture, configuration, earlier)
     carried = list(filter(params.passed_by, search.near(predicted)))[:1]
     # What slid away from where the arm has carried the body may be another thing
@@ -204,7 +204,7 @@ def _misdrawn(
     from flangeye_plugins.body.view import view_of
 
     for what, fix, other in _otherwise(body):
-        if any(map(passes, BodySearch(points, prepared(other)).everywhere())):
+        if any(map(passes, BodySearch(points, prepared(other), passes).quickly())):
             return Rejected(f"{body.name} is {what}: corrected, it would be found", fix=fix)
     shape = prepared(body)
     vertices, facets = shape.facets
@@ -215,7 +215,7 @@ def _misdrawn(
         gone = contradicted_facets(shape, view, pose)
         if gone is not None:
             rest = Looks(vertices, facets[~gone].astype(np.int32), mounted=True)
-            near = filter(holds, BodySearch(points, rest).near(pose[None]))
+            near = filter(holds, BodySearch(points, rest, holds).near(pose[None]))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:
         return None

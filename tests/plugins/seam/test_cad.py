@@ -133,7 +133,7 @@ def test_a_cad_in_another_unit_is_named(tmp_path: Path) -> None:
 def test_another_part_is_refused() -> None:
     scan, _ = scanned("v-straight")
     told = refused(scan, "v-curved")
-    assert told.startswith("seam.cad: poor fit: ")
+    assert told.startswith(("seam.cad: poor fit: ", "seam.cad: the part is nowhere in the scan; "))
     assert told.endswith("is it 'Plate with a curved V-groove' (v-curved.yaml), and in view?")
 
 
