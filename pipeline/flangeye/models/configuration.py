@@ -74,6 +74,11 @@ class Configuration:
         return self.name == "eye-on-base" and self.stands == ORIGIN
 
     @property
+    def drawn_in_flange(self) -> bool:
+        """Whether the target's frame is the flange's own."""
+        return self.target == FLANGE and self.stands == ORIGIN
+
+    @property
     def other_base(self) -> str | None:
         """Name of the unknown transform to the second arm's base, if there is one."""
         return f"{BASE}_T_{BASE2}" if self.target == FLANGE2 else None

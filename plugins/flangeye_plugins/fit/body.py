@@ -7,12 +7,15 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from flangeye import Params, stage
 from flangeye.estimation.effects.scanner import DistortionField
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.bodies import TargetBody
+from flangeye.models.configuration import Configuration
 from flangeye.models.scanners import ScannerModel
+from flangeye.models.targets import Flange
 from flangeye.types import (
     CAMERA,
     TARGET,
@@ -20,11 +23,13 @@ from flangeye.types import (
     CircleFeature,
     FlangeCloud,
     Floats,
+    PointCloud,
     PoseFeature,
     Rejected,
+    Singles,
     Transform,
 )
-from flangeye.types.geometry import hat
+from flangeye.types.geometry import basis_of_plane, hat, rotation_exp
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
@@ -47,12 +52,14 @@ class FitBodyParams(Params):
 
 
 @stage("fit.body")
-def fit_body(
+def fit_body(  # noqa: PLR0913  what it asks the runner for
     cloud: FlangeCloud,
     body: TargetBody,
     params: FitBodyParams,
     scanner: ScannerModel | None = None,
     capture: Capture | None = None,
+    flange: Flange | None = None,
+    configuration: Configuration | None = None,
 ) -> PoseFeature | CircleFeature | Rejected:
     """Fit a body to the scan around it: its surface to points, its faces' ends to the scan's edges.
 
@@ -61,6 +68,8 @@ def fit_body(
     surfaces; both effects are estimated with the pose. Errors of neighbouring points are
     correlated, so they count as patches. The covariance includes two smooth fields that no scan
     shows: the body's deviation from its CAD, and the scanner's distortion.
+
+    If the flange shows beside a tool that is drawn in the flange's frame, its rim counts too.
 
     Returns:
         The body's pose. Of a body of revolution a point of its axis and the axis, as of a circle;
@@ -93,7 +102,49 @@ def fit_body(
         "edges": float(fit.edges),
         "noise_m": fit.noise,
     }
-    return PoseFeature(Transform(CAMERA, TARGET, fit.pose), covariance, figures)
+    found = PoseFeature(Transform(CAMERA, TARGET, fit.pose), covariance, figures)
+    if not (capture and flange and configuration and configuration.drawn_in_flange):
+        return found
+    own = fit.covariance(params.model_error, lambda patches: np.zeros((len(patches), 3, 1)))
+    return _with_rim(found, own, capture.cloud.points(), flange)
+
+
+def _with_rim(found: PoseFeature, own: Floats, points: Singles, flange: Flange) -> PoseFeature:
+    """Return a tool's pose, combined with the flange's rim if a scan shows it where it belongs.
+
+    Args:
+        found: Pose of the tool, drawn in the flange's frame.
+        own: (6, 6) its covariance without the scanner's distortion, which moves the rim alike.
+        points: (N, 3) the scan.
+        flange: The flange, whose bore the tool covers.
+    """
+    from flangeye_plugins.fit.rim import RimParams, circle_of
+
+    centre, axis = found.centre, found.normal
+    near = points[np.linalg.norm(points - centre, axis=1) < 1.5 * flange.outer]
+    seen = FlangeCloud(PointCloud(CAMERA, near), centre - flange.behind * axis, axis)
+    undistorted = RimParams().model_copy(update={"scanner_error": 0.0})
+    circle = circle_of(seen, flange, {"rim": flange.rim}, undistorted)
+    if isinstance(circle, Rejected) or circle.normal is None or circle.normal_covariance is None:
+        return found
+    # A turn phi moves the normal n by phi x n, seen along two axes across it
+    across = basis_of_plane(axis)[:2]
+    moved = np.block([[np.zeros((3, 3)), np.eye(3)], [-across @ hat(axis), np.zeros((2, 3))]])
+    off = np.r_[circle.centre - centre, across @ circle.normal]
+    noise = block_diag(circle.covariance, across @ circle.normal_covariance @ across.T)
+    spread = moved @ own @ moved.T + noise
+    if off @ np.linalg.solve(spread, off) > chi2_quantile(0.99, len(off)):
+        return found  # the rim of something else, such as an adapter
+    gain = np.linalg.solve(spread, moved @ own).T
+    step = gain @ off
+    camera_T_body = found.camera_T_target.matrix.copy()
+    camera_T_body[:3, :3] = rotation_exp(step[:3]) @ camera_T_body[:3, :3]
+    camera_T_body[:3, 3] += step[3:]
+    covariance = found.covariance - gain @ moved @ own
+    figures = {**found.figures, "flange_arc": circle.arc_coverage}
+    return PoseFeature(
+        Transform(CAMERA, TARGET, camera_T_body), (covariance + covariance.T) / 2, figures
+    )
 
 
 def _round(pose: Floats, covariance: Floats, symmetry: Symmetry) -> CircleFeature:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -64,6 +66,13 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     is deterministic. For a wrist circle the centre is moved along the normal by the plate's
     thickness, to the origin of the robot's flange frame.
     """
+    return circle_of(cloud, flange, flange.radii, params)
+
+
+def circle_of(
+    cloud: FlangeCloud, flange: Flange, radii: Mapping[str, float], params: RimParams
+) -> CircleFeature | Rejected:
+    """Return a flange's circle as ``fit.rim`` does, from its edges of the given ``radii`` [m]."""
     points = cloud.cloud.xyz.astype(np.float64, order="F")
     rough = Plane(cloud.centre, cloud.normal)
     # The face is sought within 3 mm of the rough plane.
@@ -74,13 +83,13 @@ def fit_rim(cloud: FlangeCloud, flange: Flange, params: RimParams) -> CircleFeat
     if len(flat) < FEWEST_POINTS:
         return Rejected(f"{len(flat)} points on the face, at least {FEWEST_POINTS} are needed")
     start = face.flatten(cloud.centre[None])[0]
-    nominal = np.array(list(flange.radii.values()))
+    nominal = np.array(list(radii.values()))
     rings = find_rings(flat, nominal, start, params.inlier / 2)
-    problem = _why_not(rings, flange, params)
-    if problem:
+    if problem := _why_not(rings, radii, params):
         return Rejected(problem)
     plane = away_from_edges(points, face, rings, flange)
-    return _feature(points, plane, face, rings, flange, params)
+    found = _feature(points, plane, face, rings, flange, params)
+    return replace(found, radii=dict(zip(radii, rings.circles.radii.tolist(), strict=True)))
 
 
 def _ring_of(flange: Flange) -> tuple[float, float]:
@@ -96,10 +105,10 @@ def _on_face(face: Plane, points: Floats) -> Mask:
     return np.asarray((heights > -2.5 * sigma) & (heights < 6.0 * sigma))
 
 
-def _why_not(rings: Rings, flange: Flange, params: RimParams) -> str | None:
+def _why_not(rings: Rings, radii: Mapping[str, float], params: RimParams) -> str | None:
     """Return the reason why the circles are not the flange's; None if they are."""
     coverage = rings.coverage(params.inlier)
-    for k, (name, expected) in enumerate(flange.radii.items()):
+    for k, (name, expected) in enumerate(radii.items()):
         if coverage[k] < params.min_coverage:
             return (
                 f"{coverage[k]:.0%} of the {name} lies within {params.inlier * 1e3:g} mm of a "
@@ -151,7 +160,7 @@ def _feature(
     return CircleFeature(
         centre=centre + to_flange * plane.normal,
         normal=plane.normal,
-        radii=dict(zip(flange.radii, rings.circles.radii.tolist(), strict=True)),
+        radii={},
         covariance=axes.T @ _centre_covariance(rings, of_plane, params) @ axes,
         normal_covariance=axes[:2].T @ of_plane[:2, :2] @ axes[:2],
         arc_coverage=float(rings.coverage(params.inlier)[0]),

@@ -13,6 +13,7 @@ from flangeye.errors import RecipeError, StageError
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.models.loading import load_model
+from flangeye.models.targets import Flange, plate_of
 from flangeye.plugin.registry import load_registry
 from flangeye.types import (
     BASE,
@@ -23,6 +24,7 @@ from flangeye.types import (
     CircleFeature,
     Earlier,
     FlangeCloud,
+    Floats,
     Observation,
     PointCloud,
     PoseFeature,
@@ -31,14 +33,14 @@ from flangeye.types import (
 )
 from flangeye.types.geometry import hat, rigid, rotation_from_rpy, rotation_log
 from flangeye.workflow.recipe.load import load_recipe, parse_recipe
-from flangeye_emulators.world.mesh import MATERIALS, Mesh, box
+from flangeye_emulators.world.mesh import MATERIALS, Mesh, box, flange_mesh, wrist_mesh
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
 from flangeye_plugins.body.search import BodySearch
 from flangeye_plugins.body.search import around as points_around
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
-from flangeye_plugins.segment.body import SegmentBodyParams, _passes, segment_body
+from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
 from tools.study_bodies import SCANNER, as_made, scene, trial
 
 
@@ -48,7 +50,8 @@ def shipped(name: str) -> TargetBody:
     return load_body(name, None, Path())
 
 
-GRIPPER = shipped("gripper")
+GRIPPER, PASSES = shipped("gripper"), SegmentBodyParams().passed_by
+DRAWN = Configuration(stands=ORIGIN)  # in the flange's frame
 POSE = rigid(rotation_from_rpy(2.5, 0.6, 0.8), np.array([0.03, -0.02, 0.75]))
 
 
@@ -73,8 +76,7 @@ def scan(body: TargetBody, pose=POSE, seed: int = 0) -> Capture:
 def found(
     capture: Capture, body: TargetBody = GRIPPER, earlier: tuple[Observation, ...] = ()
 ) -> FlangeCloud | Rejected:
-    drawn_in_flange = Configuration(stands=ORIGIN)
-    return segment_body(capture, body, drawn_in_flange, Earlier(earlier), SegmentBodyParams())
+    return segment_body(capture, body, DRAWN, Earlier(earlier), SegmentBodyParams())
 
 
 def is_at(pose, one: FlangeCloud | Rejected) -> bool:
@@ -130,6 +132,59 @@ def test_what_is_stated_covers_what_scanner_and_make_do() -> None:
         error = off(feature, pose)
         chi.append(error @ np.linalg.solve(feature.covariance, error))
     assert 27.5 < sum(chi) < 100  # 99.9 % of 60 freedoms: 30.3 to 99.6
+
+
+def slim_tool() -> TargetBody:
+    """A square peg with a handle to one side, whose foot leaves a ring of the flange free."""
+    parts = [
+        box([-0.01, -0.01, 0.0], [0.01, 0.01, 0.14]),
+        box([0.01, -0.01, 0.09], [0.06, 0.01, 0.11]),
+    ]
+    return TargetBody(
+        "peg",
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([parts[0].triangles, parts[1].triangles + len(parts[0].vertices)]),
+    )
+
+
+def seen_with_flange(
+    tool: TargetBody, plate: Flange, pose: Floats, aside: float, rng: np.random.Generator
+) -> Capture:
+    """A scan of a tool on a flange whose axis is ``aside`` of the tool's [m]."""
+    made, carrier = as_made(tool, rng), pose @ rigid(np.eye(3), np.array([aside, 0.0, 0.0]))
+    bodies = [
+        SolidBody(Mesh(made.vertices, made.triangles).moved(pose), MATERIALS["matt"]),
+        SolidBody(flange_mesh(plate).moved(carrier), MATERIALS[plate.details.finish]),
+        SolidBody(wrist_mesh(plate).moved(carrier), MATERIALS["painted"]),
+    ]
+    xyz = scanner_of(SCANNER, 0.5, 1.0, rng).scan(RaycastScene(bodies), rng)
+    return Capture("0000", PointCloud(CAMERA, xyz), {})
+
+
+@pytest.mark.parametrize(("aside", "fewest", "most"), [(0.0, 4, 8), (2e-3, 0, 0)])
+def test_a_flange_that_shows_beside_the_tool_counts_too(
+    aside: float, fewest: int, most: int
+) -> None:
+    """Unless its rim is not where the tool's mesh has the flange."""
+    tool, plate = slim_tool(), plate_of(load_model("robots", "ur5e", Path()))
+    chi, counted = [], 0
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        pose = rigid(rotation_from_rpy(*rng.normal([2.6, 0.3, 0.0], 0.15)), POSE[:3, 3])
+        capture = seen_with_flange(tool, plate, pose, aside, rng)
+        both, alone = (
+            fit_body(around(capture, pose), tool, FitBodyParams(), SCANNER, capture, seen, DRAWN)
+            for seen in (plate, None)
+        )
+        assert isinstance(both, PoseFeature) and isinstance(alone, PoseFeature)
+        error = off(both, pose)
+        chi.append(error @ np.linalg.solve(both.covariance, error))
+        if "flange_arc" in both.figures:
+            counted += 1
+            # The centre is known better, and along the whole tool
+            assert np.trace(both.covariance[3:, 3:]) < 0.6 * np.trace(alone.covariance[3:, 3:])
+    assert fewest <= counted <= most
+    assert sum(chi) < 84  # 99.9 % of 48 freedoms
 
 
 def test_a_scanner_without_a_model_has_the_distortion_that_is_stated() -> None:
@@ -374,7 +429,7 @@ def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
     bodies, _ = scene(rng, as_made(plate, rng))
     points = scanner_of(SCANNER, 0.35, 1.0, rng).scan(RaycastScene(bodies), rng).reshape(-1, 3)
     points, looks = points[np.isfinite(points[:, 2])].astype(np.float32), prepared(plate)
-    aside = BodySearch(points, looks).everywhere()[0].pose
+    aside = BodySearch(points, looks, PASSES).everywhere()[0].pose
     near = PointCloud(CAMERA, points_around(points, looks, aside))
     laid = FlangeCloud(near, aside[:3, 3], np.array([0, 0, -1.0]), aside)
     told = fit_body(laid, plate, FitBodyParams(), SCANNER)
@@ -424,9 +479,9 @@ def test_a_mirrored_mesh_that_a_half_turn_hides_is_refused_by_what_its_image_exp
 def test_of_two_poses_the_one_that_explains_a_patch_more_is_taken_alone() -> None:
     capture, plate, pose = among_others("ring-plate", 780028)
     points, looks = capture.cloud.points(), prepared(plate)
-    search = BodySearch(points, looks)
+    search = BodySearch(points, looks, PASSES)
     turned = [pose, *looks.twins(pose)]
-    passing = [one for one in search.near(np.array(turned)) if _passes(one, 0.3, 0.99)]
+    passing = [one for one in search.near(np.array(turned)) if PASSES(one)]
     assert len(passing) == 2
     kept = search.unrivalled(passing, passing)
     assert [np.linalg.norm((one.pose - pose)[:3, 3]) < 1e-3 for one in kept] == [True]
