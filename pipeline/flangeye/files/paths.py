@@ -25,12 +25,6 @@ WHOLE = PlainSerializer(lambda path: str(path.absolute()), return_type=str, when
 """How a path is written into a resolved recipe: it is the same from any folder."""
 
 
-def exists(path: Path) -> bool:
-    """Return whether there is a file or folder; a name that no file system takes has none."""
-    # Path.exists raises OSError for a name that is too long
-    return os.path.exists(path)  # noqa: PTH110
-
-
 def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
     if not isinstance(value, (str, Path)):
         raise ValueError("a path is text")

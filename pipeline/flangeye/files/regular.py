@@ -20,6 +20,12 @@ _POINTER = b"version https://git-lfs.github.com/spec/"
 """First bytes of a Git LFS pointer, the small text that replaces a large file."""
 
 
+def exists(path: Path) -> bool:
+    """Return whether there is a file or folder; a name that no file system takes has none."""
+    # Path.exists raises OSError for a name that is too long
+    return os.path.exists(path)  # noqa: PTH110
+
+
 def open_regular(path: Path, error: type[FlangeyeError] = StageError) -> BinaryIO:
     """Open a regular file, or a link to one, for reading; never blocks as on a FIFO.
 

@@ -37,9 +37,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from flangeye import Params, RecipeError, StageError, part
 from flangeye.files.clouds import PER_METRE, LengthUnit
-from flangeye.files.paths import exists
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.regular import read_text
+from flangeye.files.regular import exists, read_text
 from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES, is_cloud, with_companion
 from flangeye.files.yaml_lines import read_yaml
 from flangeye.types import FLANGE, FLANGE2, Floats, Role

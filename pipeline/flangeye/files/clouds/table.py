@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import StageError
-from flangeye.files.paths import exists
-from flangeye.files.regular import open_regular
+from flangeye.files.regular import exists, open_regular
 
 
 def refuse(path: Path | str, what: str) -> NoReturn:
