@@ -74,6 +74,18 @@ def test_a_history_comes_back_with_its_key_and_is_empty_before_its_first_check(
         History.read(path, "another")
 
 
+@pytest.mark.parametrize("when", [0, (1 << 63) - 1])
+def test_a_check_of_an_unknown_or_a_far_time_that_found_a_step_at_once_is_read(
+    tmp_path: Path, when: int
+) -> None:
+    told = finding(0, state="MOVED", since=0, probability=1.0)
+    history(tmp_path / "h.jsonl", told, times=[when]).write()
+    read = History.read(tmp_path / "h.jsonl", "key")
+    assert read.findings == [told]
+    assert read.checks[0].time_ns == when
+    assert (finding(0).probability, MonitorCheck("source", ()).time_ns) == (0.0, 0)
+
+
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
