@@ -237,7 +237,7 @@ def test_a_body_that_is_not_there_is_refused() -> None:
     [
         (np.diag([-1.0, 1.0, 1.0]), "torch is drawn mirrored"),
         (25.4 * np.eye(3), "torch is 25.4 times too large"),
-        (np.eye(3) / 10, "torch is 10 times too small"),
+        pytest.param(np.eye(3) / 10, "torch is 10 times too small", marks=pytest.mark.slow),
         pytest.param(1.3 * np.eye(3), "no pose of torch", marks=pytest.mark.slow),
     ],
     ids=["mirrored", "inches", "centimetres", "30 % too large"],
@@ -320,7 +320,7 @@ def test_a_part_that_moves_is_seen_in_what_the_scan_is_off() -> None:
     assert np.linalg.norm(off(feature)[3:]) < 2e-3
 
 
-@pytest.mark.parametrize("further", [0.01, -0.008])
+@pytest.mark.parametrize("further", [0.01, pytest.param(-0.008, marks=pytest.mark.slow)])
 def test_a_part_that_stands_elsewhere_is_named(further: float) -> None:
     moved = GRIPPER.vertices.copy()
     jaws = (moved[:, 2] > 0.1055) & (np.abs(moved[:, 0]) < 0.04)
