@@ -15,8 +15,6 @@ controller a command that outlasts :data:`SILENT`. Times are those of ``time.mon
 every process of a machine shares and which nobody sets.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import re

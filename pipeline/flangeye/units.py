@@ -3,8 +3,6 @@
 The conversion is exact in decimal, so that a resolved recipe reads back bit for bit.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable

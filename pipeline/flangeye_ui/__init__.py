@@ -4,8 +4,6 @@ It contains no calibration logic: the engine checks recipes, runs are processes 
 and pages show their logs.
 """
 
-from __future__ import annotations
-
 from flangeye_ui.server import serve
 
 __all__ = ["serve"]

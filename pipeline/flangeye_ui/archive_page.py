@@ -1,7 +1,5 @@
 """Archive page: compares the sessions of a folder, shows logs by capture, and batches."""
 
-from __future__ import annotations
-
 import asyncio
 import csv
 import io

@@ -1,7 +1,5 @@
 """Charts of a run: residuals by pose, coverage of the workspace, path of the flange."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence, Set
 from typing import Any
 

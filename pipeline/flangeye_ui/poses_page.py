@@ -1,7 +1,5 @@
 """Poses page: arm, workspace box, scanner and planned poses in 3D; nothing moves."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from typing import Any, cast

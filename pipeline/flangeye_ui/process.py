@@ -1,7 +1,5 @@
 """A run or a live check as a child process, followed by its log."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import signal

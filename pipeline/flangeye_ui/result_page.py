@@ -1,7 +1,5 @@
 """Page *Result*: warnings, the matrix with its errors, and what would improve it."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable
 from functools import partial

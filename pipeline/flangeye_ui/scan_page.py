@@ -1,7 +1,5 @@
 """Page *Scan*: asks before anything moves, shows captures as they arrive, and can stop."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from itertools import islice

@@ -1,7 +1,5 @@
 """The cell in 3D: floor, axes, the arm by its shape, box, scanner, poses and the flange as seen."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache

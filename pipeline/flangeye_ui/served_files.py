@@ -1,7 +1,5 @@
 """Serve files of runs and batches in a browser sandbox, as they may come from anywhere."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote

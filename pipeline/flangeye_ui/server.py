@@ -6,8 +6,6 @@ program on another port of this machine receives or replaces it. The pages behin
 do not see cookies.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import logging
 import os

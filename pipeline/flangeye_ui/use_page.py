@@ -1,7 +1,5 @@
 """Use: the calibration as other systems take it, and its certificate."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Sequence
 from contextlib import suppress

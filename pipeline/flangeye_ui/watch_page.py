@@ -1,7 +1,5 @@
 """Watch page: validity of stored calibrations by the checks of ``flangeye monitor``."""
 
-from __future__ import annotations
-
 import asyncio
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """``arc.simulated``: a power source that only records how it was switched."""
 
-from __future__ import annotations
-
 from flangeye.devices import Arc, Device, DeviceError
 from flangeye.models.arc import ArcTimes
 from flangeye.plugin.stage import Params, part

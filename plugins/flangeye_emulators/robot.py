@@ -1,7 +1,5 @@
 """``robot.simulated`` and ``robot.emulator``: arms without hardware."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 from contextlib import suppress

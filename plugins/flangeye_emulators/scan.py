@@ -1,7 +1,5 @@
 """``scan.simulated``: a workpiece on a bench, before the scanner of a simulated cell."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flangeye import StageError, stage

@@ -1,7 +1,5 @@
 """``python -m flangeye_paper``: from the tables of batches to CSV files and pictures."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated

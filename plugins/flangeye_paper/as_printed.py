@@ -7,8 +7,6 @@ by ``n_v``. Line 10 needs a refined path before one exists; here the plan is use
 clipped to the robot's limits, as on any robot.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

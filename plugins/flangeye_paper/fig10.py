@@ -1,7 +1,5 @@
 """Figure 10: calibration error by the number of poses, at 1 mm of noise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

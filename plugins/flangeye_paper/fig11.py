@@ -1,7 +1,5 @@
 """Figure 11: calibration error by the number of poses, on the published recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Figure 13, and a quantity the paper does not measure: the torch's distance from the true seam."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figure 9: calibration error by scanner noise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Errors on poses that took no part, on the published recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Equation (11) as the authors' scripts computed it, and Algorithm 1 judged by it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 

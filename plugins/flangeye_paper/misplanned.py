@@ -1,7 +1,5 @@
 """A seam with a chosen planning error, for studies of how touch corrects it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flangeye import stage

@@ -7,8 +7,6 @@ After normalisation it has an arbitrary direction within the patch (isl-org/Open
 in 0.8.0). A face of a CAD cloud is such a patch.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -7,8 +7,6 @@ at which plain least squares shows the slope of the published figure 9, 0.62 mm 
 millimetre of noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ stored matrix H and its ICP motion T is the camera pose to which ICP converges, 
 H T follows the result of ICP for any other matrix, as far as ICP converges.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

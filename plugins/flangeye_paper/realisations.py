@@ -1,7 +1,5 @@
 """Repeat the solve step on newly drawn noise; and the cost of section 3.1, which uses the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

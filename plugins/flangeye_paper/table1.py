@@ -1,7 +1,5 @@
 """Table 1 and the Kinect row: errors of the calibration from all poses, measured by ICP."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Table 2: a calibration sphere beside the flange itself, simulated."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

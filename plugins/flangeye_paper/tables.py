@@ -1,7 +1,5 @@
 """Read the results of ``flangeye batch``, and write figures and tables in the paper's style."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence

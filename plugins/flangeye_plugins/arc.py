@@ -1,7 +1,5 @@
 """Kind ``arc``: welding power sources, for weld.tactile."""
 
-from __future__ import annotations
-
 import select
 import socket
 import struct

@@ -1,7 +1,5 @@
 """One number from a pose error: the paper's ``||.||_cost`` (sections 2.1.4 and 4.2), in metres."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

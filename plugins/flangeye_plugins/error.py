@@ -1,7 +1,5 @@
 """How ``solve.iterative`` measures a candidate: the parts ``error.icp`` and ``error.holdout``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

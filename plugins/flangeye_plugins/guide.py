@@ -1,7 +1,5 @@
 """``guide.tactile``: lead a person through the calibration of a finger."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path

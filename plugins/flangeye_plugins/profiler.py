@@ -7,8 +7,6 @@ from the joint over TCP, one line for each profile. The recipe states the column
 unit and its sign. A line without a number in that column is skipped.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 import threading

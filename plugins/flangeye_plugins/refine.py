@@ -1,7 +1,5 @@
 """``refine.*``: change a calibration after solving: for the arm's errors, or by equation (19)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, ClassVar

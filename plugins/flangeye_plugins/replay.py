@@ -1,7 +1,5 @@
 """Replay of a weld's decisions, from the images and poses in its log."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path as FilePath

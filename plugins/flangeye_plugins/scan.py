@@ -1,7 +1,5 @@
 """``scan.*``: scans of the workpiece, from files, and along a line with the scanner in the hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``sensor.*``: cameras that watch a compliant finger, and recordings of them."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """A guess of the scanner's pose before the first scan, good enough to plan poses in view."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

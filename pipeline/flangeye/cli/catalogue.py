@@ -1,7 +1,5 @@
 """List arms, scanners, standards, recipes, stages, parts and plugins; create new models."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

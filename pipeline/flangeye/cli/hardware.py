@@ -1,7 +1,5 @@
 """Commands for devices: calibrate a finger, touch points, emulate a controller."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated

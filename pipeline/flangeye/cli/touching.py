@@ -1,7 +1,5 @@
 """``flangeye touch``: move the arm to scanned points and compare with the prediction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Arrays of numbers in files, with the shape that a layout states."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

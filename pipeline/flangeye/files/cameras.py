@@ -4,8 +4,6 @@ These are ROS's ``camera_info``, OpenCV's FileStorage, kalibr's camchain, COLMAP
 RealSense's and Zivid's intrinsics, NumPy arrays, and text with labels.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

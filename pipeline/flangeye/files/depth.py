@@ -1,7 +1,5 @@
 """Read scans: clouds, and depth images with the calibration of their camera beside them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache

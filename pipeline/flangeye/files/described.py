@@ -1,7 +1,5 @@
 """Models whose fields are described by the text below each, as constants are."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import textwrap

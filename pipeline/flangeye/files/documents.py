@@ -1,7 +1,5 @@
 """Named values as plain data: JSON, YAML, TOML, XML, Python's literals, NumPy and MATLAB."""
 
-from __future__ import annotations
-
 import ast
 import io
 import json

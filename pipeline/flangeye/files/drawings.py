@@ -4,8 +4,6 @@ A DXF file consists of pairs of lines: a group code and its value (AutoCAD's DXF
 entities are skipped.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Decode image files, with bounded size and one-line errors."""
 
-from __future__ import annotations
-
 import os
 import struct
 from pathlib import Path

@@ -4,8 +4,6 @@ A damaged file can crash scipy's parser, or let it ask for any memory. Nothing o
 imported here.
 """
 
-from __future__ import annotations
-
 import io
 import resource
 import sys

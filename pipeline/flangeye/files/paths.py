@@ -1,7 +1,5 @@
 """Files named by a parameter, and local or remote folders."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Processes that this one starts, and those it asks through their standard input and output."""
 
-from __future__ import annotations
-
 import contextlib
 import mmap
 import os

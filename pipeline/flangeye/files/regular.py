@@ -1,7 +1,5 @@
 """Read only regular files of bounded size; write files atomically."""
 
-from __future__ import annotations
-
 import os
 import stat
 import tempfile

@@ -4,8 +4,6 @@ The rest of the program uses paths only. An archive by URL gets a local folder w
 its name: small files whole, scans and images empty until they are read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import ipaddress
 import re

@@ -1,7 +1,5 @@
 """Find the scans that belong to poses: clouds and images, paired by name or number."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import defaultdict

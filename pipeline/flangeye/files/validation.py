@@ -1,7 +1,5 @@
 """Turn pydantic's validation errors into one-line messages that name what is allowed."""
 
-from __future__ import annotations
-
 from dataclasses import is_dataclass
 from typing import Any, get_args, get_type_hints
 

@@ -1,7 +1,5 @@
 """Make foreign text safe to print on a terminal."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

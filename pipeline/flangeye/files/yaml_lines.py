@@ -5,8 +5,6 @@ two equal keys silently replaces the first. Here these are a text, twelve, a num
 Tags, anchors and aliases are refused, so nothing is executed and nothing expands.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import suppress

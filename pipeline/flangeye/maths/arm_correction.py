@@ -1,7 +1,5 @@
 """The flange's true pose, given a model of the arm's reporting errors. Arrays only."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace

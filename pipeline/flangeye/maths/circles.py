@@ -3,8 +3,6 @@
 Robust without random sampling: there is no seed, and the order of the points does not matter.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from flangeye.types import Floats, Indices

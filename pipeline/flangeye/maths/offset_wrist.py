@@ -11,8 +11,6 @@ Closed forms of other arms come from EAIK, which decomposes an arm into Paden-Ka
 IEEE RA-L 2025): spherical wrists, three parallel axes, and most arms sold are one or the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Poses are (N, 4, 4) ``base_T_flange`` [m], in the order they were recorded.
 """
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

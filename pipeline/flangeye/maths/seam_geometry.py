@@ -1,7 +1,5 @@
 """Geometry of seams: polylines from segments, frames, tube of uncertainty, deviations."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np

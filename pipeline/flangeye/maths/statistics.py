@@ -1,7 +1,5 @@
 """The few statistics that solvers and verifiers share. Arrays only."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from typing import TypeVar

@@ -3,8 +3,6 @@
 Times are (N,) ascending [s], poses (N, 4, 4) [m]. Arrays only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The times of a welding arc: parameters that every ``arc`` part has."""
 
-from __future__ import annotations
-
 from pydantic import ConfigDict
 
 from flangeye.files.described import Described

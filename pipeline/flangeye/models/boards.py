@@ -4,8 +4,6 @@ The frame ``target`` has its origin in the middle of the board, x to the right, 
 the viewer. Lengths are those of the print [m].
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 

@@ -11,8 +11,6 @@ where its place is not known; ``base_T_base2`` where another arm carries the tar
 are then in ``base2``. The paper's equations (1) to (5) and its Figs. 2, 3 and 14 are cases of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -5,8 +5,6 @@
 ``kinematics`` besides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

@@ -7,8 +7,6 @@ of a pixel; a straight side is blurred on both sides alike. Sides are straight o
 lens's distortion, which bends a side of 200 px away from the image's middle by half a pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

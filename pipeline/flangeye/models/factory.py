@@ -6,8 +6,6 @@ corrections to the Denavit-Hartenberg table. The file that the ROS driver's
 origins.
 """
 
-from __future__ import annotations
-
 import configparser
 import math
 from pathlib import Path

@@ -3,8 +3,6 @@
 The tool's axes: x from the torch to the tip (t_d of the paper), z out of the work, y to the left.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -4,8 +4,6 @@ The engine knows no middleware. A plugin offers its graphs by name through the h
 ``flangeye_graphs``: ``flangeye init --ros2`` and ``flangeye publish`` use the one named ``ros2``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol

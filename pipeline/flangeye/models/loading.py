@@ -1,7 +1,5 @@
 """Find a robot's or a scanner's model by name; write one of a user's own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal

@@ -4,8 +4,6 @@ A recipe names robots, scanners, standards and workpieces; each is a YAML file u
 file of the user's own, with units on every value and its source beside it.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """3D scanners: field of view, resolution, errors, and the unit of their files."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An arm from its URDF: kinematics and limits; its collision bodies are read when it moves."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

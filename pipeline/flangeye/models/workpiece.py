@@ -14,8 +14,6 @@
     source: where the CAD comes from
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass

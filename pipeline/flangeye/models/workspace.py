@@ -1,7 +1,5 @@
 """Coverage of the workspace by the poses so far: cells of its box, and rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The texts of ``flangeye stages``: stages and parts with their parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, get_args
 

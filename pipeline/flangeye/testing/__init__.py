@@ -5,8 +5,6 @@ then runs every ``test_…`` method of the class. Nothing here imports pytest: a
 fault raises AssertionError with one line that says what was expected.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

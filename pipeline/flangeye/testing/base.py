@@ -1,7 +1,5 @@
 """Tests for plugins of every kind: they are found, declare themselves, and are deterministic."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Tests of drivers: robots, scanners, sensors, profilers. The device or its emulator must be on."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

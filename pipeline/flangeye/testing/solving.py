@@ -1,7 +1,5 @@
 """``solve``, ``refine`` and ``verify`` stages: from centres and poses to a calibration."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

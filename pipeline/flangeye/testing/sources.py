@@ -1,7 +1,5 @@
 """``acquire`` stages, ``reader``, ``plan`` and ``view`` parts: where captures come from."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Conformance of ``scan``, ``seam`` and ``weld`` stages (with ``context``), and controllers."""
 
-from __future__ import annotations
-
 from typing import Any, get_args
 
 import numpy as np

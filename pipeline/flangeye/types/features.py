@@ -1,7 +1,5 @@
 """Measurements of a target in one capture, and reasons why a capture is rejected."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ a rotation vector, a quaternion, or three angles about axes in some order. The s
 maker's convention are beside its entry in :data:`CONVENTIONS`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Plan of a simulated cell session: parameters, poses, and which camera sees which target when."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

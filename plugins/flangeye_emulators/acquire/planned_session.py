@@ -5,8 +5,6 @@ the remaining transform follows. Further joint angles are drawn around it at ran
 kept at which the camera sees the target.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal

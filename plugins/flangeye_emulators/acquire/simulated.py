@@ -1,7 +1,5 @@
 """``acquire.simulated``: moves a simulated arm and renders each scan; the truth is known."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass

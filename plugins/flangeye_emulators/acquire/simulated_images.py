@@ -1,7 +1,5 @@
 """``acquire.simulated_images``: images of a printed target in any configuration."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """Simulated sessions of markers: noisy poses, in any configuration or in a cell."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar

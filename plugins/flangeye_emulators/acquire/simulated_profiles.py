@@ -1,7 +1,5 @@
 """``acquire.simulated_profiles``: profiles of a sphere by a line scanner on the flange."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar

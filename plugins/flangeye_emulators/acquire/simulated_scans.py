@@ -1,7 +1,5 @@
 """Simulated sessions of scans of circles: arms' flanges or plates, in configurations and cells."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np

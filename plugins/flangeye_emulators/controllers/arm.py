@@ -1,7 +1,5 @@
 """The emulated arm: follows motions within its limits, and measures contact forces."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence

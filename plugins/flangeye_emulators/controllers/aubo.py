@@ -5,8 +5,6 @@ inputs and outputs are not emulated. Requests were recorded from the library; an
 maker's interface documentation. Where that is silent, the drivers' README says so.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Mapping

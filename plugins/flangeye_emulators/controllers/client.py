@@ -1,7 +1,5 @@
 """Client of the control channel: injects faults and reads the emulator's true state."""
 
-from __future__ import annotations
-
 import ipaddress
 import json
 import socket

@@ -4,8 +4,6 @@ A motion has its own time. During a stop this time runs slower than the clock, s
 on its path and does not leave it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Executes an arm's queue of moves, or a velocity command."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Rotations agree with :mod:`flangeye.types.geometry` (tested).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A simulated profile sensor behind the torch, which measures the simulated bead."""
 
-from __future__ import annotations
-
 import bisect
 
 import numpy as np

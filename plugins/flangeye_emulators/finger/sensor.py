@@ -1,7 +1,5 @@
 """A simulated finger: its tip in a workpiece's groove, and a camera that renders images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import ClassVar
 

@@ -4,8 +4,6 @@ The model is quasi-static: the tip moves to the position of least elastic energy
 walls, as far as friction permits. Lengths are in [m].
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

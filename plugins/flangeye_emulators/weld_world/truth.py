@@ -4,8 +4,6 @@ A recipe names one of ``data/worlds``, or its own file. Values are in [m], [rad]
 files each has its unit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar, dataclass_transform

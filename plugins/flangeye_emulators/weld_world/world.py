@@ -1,7 +1,5 @@
 """The true state of a simulated weld: tip, tag, torch and seam."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A simulated arm whose true pose differs from the reported one, like a real arm's."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import numpy as np

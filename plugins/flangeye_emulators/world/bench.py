@@ -5,8 +5,6 @@ Simulated arms of this process therefore register here, and simulated sensors lo
 going through the controller.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 from weakref import WeakSet, ref
 

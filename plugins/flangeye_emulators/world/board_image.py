@@ -1,7 +1,5 @@
 """Render a printed board with perspective, lens, blur and noise, and its depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

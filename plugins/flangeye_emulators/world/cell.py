@@ -1,7 +1,5 @@
 """The simulated cell: an arm on a table, a wall, and a stand with a disc as a distractor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -5,8 +5,6 @@ lens with a lamp beside it, and errors of phase measurement. At depth steps both
 points and create flying pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """``acquire.archive``: recorded scans and robot poses, read by a reader for their layout."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Images from files, and the calibration of the camera that took them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``acquire.centres`` and ``acquire.samples``: features detected by another program."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -13,8 +13,6 @@ the alternative's effect is negligible, not zero: a minimum-effect test (Murphy 
 non-central F distribution.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

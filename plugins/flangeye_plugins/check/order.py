@@ -1,7 +1,5 @@
 """Checks of order and constancy: shuffled or repeated poses, and parts that moved."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Checks for single wrong samples, targets detected with a flipped rotation, and missing motion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Find rotations read in a wrong convention, and inverted poses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Lengths in other units than configured: positions of the arm or of the target."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Robust fits of a disc's face, and of concentric circles with free radii to edge points."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``fit.ransac_circle``: the paper's fit, RANSAC with circles through three points."""
 
-from __future__ import annotations
-
 from typing import ClassVar, NamedTuple
 
 import numpy as np

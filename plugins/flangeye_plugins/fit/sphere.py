@@ -1,7 +1,5 @@
 """``fit.sphere``: centre of a calibration sphere from its visible cap."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np

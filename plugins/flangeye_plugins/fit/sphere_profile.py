@@ -1,7 +1,5 @@
 """``fit.sphere_profile``: centre of a calibration sphere from one profile of a line scanner."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Covariance of fits to points whose errors are correlated with their neighbours'."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@
 ``plan.next_best`` the pose that reduces the expected error at the work most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import ClassVar
 

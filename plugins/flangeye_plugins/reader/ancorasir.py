@@ -9,8 +9,6 @@ Six recordings in one repository, each in a layout of its own::
     calib_toolbox/data/2019-06-14-sample/    NN_tool.ply (mm), calib_data.json (m, centres mm)
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """``reader.auto``: choose the reader that fits a path, among all installed ones."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

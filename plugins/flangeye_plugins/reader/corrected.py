@@ -5,8 +5,6 @@
     - acquire.archive: {reader: {corrected: {reader: folder, robot: {inverted: true}}}}
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

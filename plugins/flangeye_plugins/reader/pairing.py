@@ -1,7 +1,5 @@
 """Pair an arm's recorded poses with a camera's measurements on another clock."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Robot poses from files, validated, as (4, 4) matrices in metres."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ with the recipe's ``robot``. The camera's measurements come from ``PointCloud2``
 detected in the arm's motion, and clouds and poses are paired by time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Messages of ROS 2 bags, MCAP or SQLite, without ROS; clouds and images of them as files."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager

@@ -17,8 +17,6 @@ Zivid's samples are ``pos01.yaml``, a matrix of the SDK (``FloatMatrix: Data:``)
 (``PoseState``), with ``img01.ply`` beside it. Zivid's own are in millimetres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path

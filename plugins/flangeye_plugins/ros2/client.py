@@ -1,7 +1,5 @@
 """Client of the bridge process that runs under ROS 2's own Python."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

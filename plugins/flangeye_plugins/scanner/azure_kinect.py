@@ -4,8 +4,6 @@ The camera runs in a separate process, because libk4a may abort its process when
 unplugged, which must not end the run.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time

@@ -1,7 +1,5 @@
 """``scanner.genicam``: 3D scanners with GenICam, such as Photoneo's, through harvesters."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

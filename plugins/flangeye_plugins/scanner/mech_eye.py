@@ -1,7 +1,5 @@
 """``scanner.mech_eye``: a Mech-Eye industrial 3D camera, through the maker's API."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any, ClassVar

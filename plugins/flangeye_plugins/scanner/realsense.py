@@ -1,7 +1,5 @@
 """``scanner.realsense``: a RealSense depth camera, or its recording, through pyrealsense2."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable

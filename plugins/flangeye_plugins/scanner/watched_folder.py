@@ -1,7 +1,5 @@
 """``scanner.watched_folder``: reads the clouds that the scanner's own software exports."""
 
-from __future__ import annotations
-
 import re
 import sys
 import threading

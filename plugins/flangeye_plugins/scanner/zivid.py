@@ -1,7 +1,5 @@
 """``scanner.zivid``: a Zivid camera, or a file camera, through the maker's SDK."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``seam.cad``: plan a seam from the workpiece's CAD."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from flangeye import CalibrationRefused, StageError, stage

@@ -1,7 +1,5 @@
 """Find the ends of surfaces in a scan: of a plate across the seam, and of the seam itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

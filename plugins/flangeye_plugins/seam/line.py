@@ -1,7 +1,5 @@
 """``seam.line``: take a seam from a file of taught points, a table, a drawing or a CAD's edge."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Common part of the seam stages: a seam in the base from a line in the scan."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Thinning and normals of a scan's points."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Register a CAD to a scan: find the part, fit its pose, and reject poor or ambiguous fits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

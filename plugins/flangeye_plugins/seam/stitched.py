@@ -6,8 +6,6 @@ the arm at that pose. The error of a point seen in several clouds is the mean of
 Clouds that show the same face must agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -5,8 +5,6 @@ unknowns are cubic B-splines y(s), z(s) and roll(s), and the section's shape. We
 and splines bridge stretches without points, where the covariance grows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

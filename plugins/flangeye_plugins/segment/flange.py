@@ -1,7 +1,5 @@
 """``segment.flange``: find the flange in a scan of the whole cell."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import ClassVar

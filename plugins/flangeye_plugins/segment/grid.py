@@ -1,7 +1,5 @@
 """A coarse organised view of any scan, with a tenth of its points or less."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

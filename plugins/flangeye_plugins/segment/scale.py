@@ -1,7 +1,5 @@
 """Check whether a cloud's coordinates can be in metres."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """``segment.sphere``: find a calibration sphere in a scan of the whole cell."""
 
-from __future__ import annotations
-
 from typing import ClassVar, NamedTuple
 
 import numpy as np

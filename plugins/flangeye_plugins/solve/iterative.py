@@ -1,7 +1,5 @@
 """``solve.iterative``: the paper's Algorithm 1, which improves a small pool of poses one by one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice

@@ -1,7 +1,5 @@
 """One stage for each closed-form method of the literature, for comparison and for speed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Conversion of observations to arrays, and of arrays to a calibration result."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

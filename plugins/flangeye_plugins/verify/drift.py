@@ -1,7 +1,5 @@
 """``verify.drift``: compare a run's observations with an earlier calibration of the same cell."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``verify.holdout``: error of a calibration on poses that were not used for it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """``verify.icp``: the paper's check, equation (11): the scanned flange against its true shape."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

@@ -5,8 +5,6 @@ arbitrary rotation about the axis of a round plate, which is not observable. Her
 stays zero.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``verify.sphere``: compare distances between target positions by scanner and by arm."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

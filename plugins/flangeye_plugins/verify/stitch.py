@@ -1,7 +1,5 @@
 """``verify.stitch``: overlay all views of the flange in the flange's frame."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

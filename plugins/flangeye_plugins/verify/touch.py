@@ -1,7 +1,5 @@
 """``verify.touch``: compare scanned points with the same points touched by a tip."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 

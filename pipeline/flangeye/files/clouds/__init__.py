@@ -6,8 +6,6 @@ kept as missing points, so that organised clouds keep their grid. A file with no
 points is valid.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path

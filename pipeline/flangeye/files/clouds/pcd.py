@@ -3,8 +3,6 @@
 Points are taken in the frame they are written in; a viewpoint is applied on request only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """PLY, the Stanford polygon format: ASCII and both binary orders; points are its vertices."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables of points inside files: checked against the file's size, then decoded."""
 
-from __future__ import annotations
-
 import io
 import math
 from abc import ABC, abstractmethod

@@ -11,8 +11,6 @@ are the rows that have a cell ``marker``. ``poses.npz:arm`` are the arrays of a 
 long as ``arm``. Several names are tables side by side.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from bisect import bisect

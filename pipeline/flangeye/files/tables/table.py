@@ -1,7 +1,5 @@
 """A table: rows of named cells, read from any kind of file."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """``flangeye new-plugin``: write an installable package whose tests pass at once."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

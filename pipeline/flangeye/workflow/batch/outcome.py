@@ -1,7 +1,5 @@
 """One session of a batch: its request, and its outcome as a row of the tables."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path

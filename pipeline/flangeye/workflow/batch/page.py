@@ -1,7 +1,5 @@
 """``summary.html``: all sessions side by side, in one self-contained file."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """A batch worker: runs sessions one by one; a failure is a value and stops no other session."""
 
-from __future__ import annotations
-
 import secrets
 import socket
 import time

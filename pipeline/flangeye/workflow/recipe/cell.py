@@ -1,7 +1,5 @@
 """From a recipe's ``cell`` section to the graph of frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 

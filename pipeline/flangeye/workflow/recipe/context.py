@@ -4,8 +4,6 @@ The value of a section with a mistake is None, so that the mistake is reported o
 and not again by every step that needs the value.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Find a recipe by its path or its name."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``--set steps.2.inlier='0.2 mm'``: change one value of a recipe before it is checked."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 from typing import Any
 

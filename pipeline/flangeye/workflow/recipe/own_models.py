@@ -1,7 +1,5 @@
 """A recipe's own model files, stored in the log so that it can be read elsewhere."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """JSON Schema of recipes, for editors that check and complete YAML."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

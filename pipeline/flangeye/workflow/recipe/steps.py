@@ -1,7 +1,5 @@
 """The steps of a recipe: a stage with its parameters each, in an order that makes sense."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType

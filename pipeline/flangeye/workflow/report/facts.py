@@ -4,8 +4,6 @@ A finished run's log contains its result. For a killed run the same document is 
 log with the same functions, so that reports need not distinguish the two.
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

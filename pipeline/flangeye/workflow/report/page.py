@@ -1,7 +1,5 @@
 """Put the page together: sections and figures into the template, plotly.js and all inside."""
 
-from __future__ import annotations
-
 import os
 from base64 import b64encode
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The page's script sets the theme: text, grid and background.
 """
 
-from __future__ import annotations
-
 from base64 import b64encode
 from html import escape
 from itertools import combinations, product

@@ -1,7 +1,5 @@
 """The bar plot of the residual of every pose, with its held-out error beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape

@@ -1,7 +1,5 @@
 """The error over the workspace, in the frame of the camera's pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

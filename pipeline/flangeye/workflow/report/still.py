@@ -1,7 +1,5 @@
 """A still SVG picture of a cell: arm, field of view, workspace box and poses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

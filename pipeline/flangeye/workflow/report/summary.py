@@ -1,7 +1,5 @@
 """The top of the report: the verdict, the headline numbers and the matrix, ready to print."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """SI numbers as people read them in a report: millimetres, degrees, seconds."""
 
-from __future__ import annotations
-
 import math
 
 

@@ -1,7 +1,5 @@
 """Plots of a weld: paths as in the paper's Fig. 13, deviations, contact, speeds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

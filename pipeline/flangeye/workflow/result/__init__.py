@@ -4,8 +4,6 @@ The models below are its definition; ``flangeye schema --result`` prints them as
 of the same recipe, input and seed give the same document bit for bit, ``timing`` aside.
 """
 
-from __future__ import annotations
-
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence

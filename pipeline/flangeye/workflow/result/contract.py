@@ -1,7 +1,5 @@
 """The schema of ``result.json``: a model for each section."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, Literal, Self
 

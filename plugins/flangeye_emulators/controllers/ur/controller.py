@@ -1,7 +1,5 @@
 """The control box: power, safety, the running program and the arm, advanced cycle by cycle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum

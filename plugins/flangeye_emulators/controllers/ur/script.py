@@ -4,8 +4,6 @@ Command numbers are those of ur_rtde 1.6. Only the commands used by the project'
 implemented. Any other is logged and answered as done, without effect.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from functools import partial

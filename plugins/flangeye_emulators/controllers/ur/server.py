@@ -1,7 +1,5 @@
 """An emulated controller of Universal Robots as a process, with its dashboard server."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from flangeye.models.graph import EmulatorOptions

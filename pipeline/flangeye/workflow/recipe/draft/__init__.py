@@ -1,7 +1,5 @@
 """``flangeye init``: draft a valid recipe from a folder of recordings or a running cell."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """From the poses of a folder to the parameters of ``reader.table``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, get_args

@@ -5,8 +5,6 @@ they do not is wrong. The residual of A X = X B distinguishes a camera on the fl
 the robot, and a target's pose from its inverse.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

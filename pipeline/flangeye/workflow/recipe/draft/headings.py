@@ -4,8 +4,6 @@ A name of two frames gives owner and direction of a pose: ``gripper2base`` is a 
 ``camera_T_target``, ``T_cam_board`` and ``cHt`` are the target's pose in the camera.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Write a recipe's text from a survey and its answers."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

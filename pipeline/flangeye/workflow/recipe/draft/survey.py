@@ -1,7 +1,5 @@
 """Survey a folder of recordings, and ask the user what it does not show."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Sequence

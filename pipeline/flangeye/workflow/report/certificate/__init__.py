@@ -1,7 +1,5 @@
 """A printed page that states a calibration and its uncertainty after the GUM."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -7,8 +7,6 @@ point :math:`p` is moved by :math:`\varphi \times (p - q) + \tau`, so the sensit
 every point, such as the robot's repeatability.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
