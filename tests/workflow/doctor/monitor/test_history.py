@@ -91,6 +91,8 @@ def test_a_check_of_an_unknown_or_a_far_time_that_found_a_step_at_once_is_read(
     [
         (finding(1, since=2), "its finding belongs to another check"),
         (finding(0), "its finding belongs to another check"),
+        (finding(1, motion=(0.0,) * 5), "motion: "),
+        (finding(1, motion=(0.0,) * 7), "motion: "),
     ],
 )
 def test_a_finding_that_no_check_leaves_behind_is_refused(
@@ -100,6 +102,12 @@ def test_a_finding_that_no_check_leaves_behind_is_refused(
     history(path, finding(0, since=0), wrong).write()
     with pytest.raises(StageError, match=f"h.jsonl: check 1: {why}"):
         History.read(path, "key")
+
+
+def test_a_time_that_no_clock_has_is_refused(tmp_path: Path) -> None:
+    history(tmp_path / "h.jsonl", finding(0), times=[1 << 63]).write()
+    with pytest.raises(StageError, match="h.jsonl: check 0: time_ns: "):
+        History.read(tmp_path / "h.jsonl", "key")
 
 
 @pytest.mark.parametrize("covariance", [0.0, -1e-8])
