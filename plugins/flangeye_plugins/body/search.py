@@ -219,22 +219,23 @@ def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice
     return slice(low[0], high[0]), slice(low[1], high[1])
 
 
-def candidate_poses(ends: OrientedPoints, some: slice, view: CoarseImage, looks: Looks) -> Floats:
-    """Return up to 500 poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan.
+def candidate_poses(ends: OrientedPoints, view: CoarseImage, looks: Looks, effort: int) -> Floats:
+    """Return poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan, 500 per effort.
 
     Args:
         ends: Ends of surfaces in the scan.
-        some: Which of their pairs are matched, in random order.
         view: Coarse image of the scan.
         looks: The body.
+        effort: How many times 20,000 pairs of ends are matched.
     """
-    poses = _matched(ends, some, looks)
+    poses = _matched(ends, looks, 20_000 * effort)
     # Points that are compared, and tolerance as a share of the size
     scores = _chunked(poses, partial(looks.scores, view=view, count=16, tolerance=0.05))
-    poses = poses[_best_of(scores, 2_000)]
+    poses = poses[_best_of(scores, 2_000 * effort)]
     # Poses are refined by one ICP step before 40 points select the best
-    poses = looks.settled(poses, view, 16, 0.1 * looks.size)
-    return poses[_best_of(looks.scores(poses, view, 40, 0.05), 500)].astype(np.float64)
+    poses = _chunked(poses, partial(looks.settled, view=view, count=16, reach=0.1 * looks.size))
+    scores = looks.scores(poses, view, 40, 0.05)
+    return poses[_best_of(scores, 500 * effort)].astype(np.float64)
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
@@ -250,7 +251,7 @@ def _chunked(poses: Floats, work: Callable[[Floats], Floats]) -> Floats:
     return np.concatenate([work(poses[k : k + 2_000]) for k in chunks])
 
 
-def _matched(scan: OrientedPoints, some: slice, looks: Looks) -> Floats:
+def _matched(scan: OrientedPoints, looks: Looks, most: int) -> Floats:
     """Return the poses (K, 4, 4) that lay a pair of the body's ends on a like pair of the scan's.
 
     The ends of both lie alike to each other, and the pose shows both of the body's.
@@ -262,7 +263,7 @@ def _matched(scan: OrientedPoints, some: slice, looks: Looks) -> Floats:
     # Number of ends, and their spacing as a share of the size
     scan = scan.take(some_of(scan, 800, looks.size * (1 / 22), rng))
     pairs = cKDTree(scan.points).query_pairs(looks.size, output_type="ndarray")
-    pairs = rng.permutation(pairs[looks.pairs.apart(scan, pairs.T)])[some].T
+    pairs = rng.permutation(pairs[looks.pairs.apart(scan, pairs.T)])[:most].T
     own, of = looks.pairs.like(scan, pairs)
     on = pairs[:, of]
     u, _, vt = np.linalg.svd(_arrows(scan, on).transpose(0, 2, 1) @ _arrows(looks.ends, own))
@@ -321,22 +322,21 @@ class BodySearch:
         found = self.quickly()
         if any(map(self.passes, found)):
             return found
-        # An edge-on plate shows few ends
-        return self._distinct(found + self._among(slice(20_000, 80_000)))
+        # An edge-on plate shows few ends, and in a coarse scan many poses look alike
+        return self._distinct(found + self._searched(4))
 
     def quickly(self) -> list[FoundPose]:
-        """Return as ``everywhere``, from as many pairs of ends as most bodies are found by."""
-        return self._among(slice(20_000))
+        """Return as ``everywhere``, with the effort that finds most bodies."""
+        return self._searched(1)
 
-    def _among(self, some: slice) -> list[FoundPose]:
-        """Return the poses found by some of the scan's pairs of ends, in random order."""
-        poses = candidate_poses(self._ends, some, self._coarse, self.looks)
+    def _searched(self, effort: int) -> list[FoundPose]:
+        poses = candidate_poses(self._ends, self._coarse, self.looks, effort)
         # Points of the body that settle them, how far from the body the scan is taken for
         # it, move by move, and how far off it may be where it is judged, as shares of the
         # size, and how many are kept
         for count, reaches, tolerance, left in (
-            (40, (0.06, 0.05), 0.03, 200),
-            (160, (0.04, 0.03, 0.02), 0.02, 40),
+            (40, (0.06, 0.05), 0.03, 200 * effort),
+            (160, (0.04, 0.03, 0.02), 0.02, 40 * effort),
         ):
             for reach in reaches:
                 poses = self.looks.settled(poses, self._coarse, count, reach * self.looks.size)

@@ -161,8 +161,11 @@ def _searched(
     passing = list(filter(passes, every))
     found = search.unrivalled(passing, passing)
     if not found:
-        why = _why_none(every, body)
-        return (doubtful and _misdrawn(points, body, every, passes)) or why
+        for one in every:
+            # A mirrored mesh may pass as narrowly as this one fails
+            if passes(one._replace(weakest=0.0)):
+                return _unsure(one, body)
+        return (doubtful and _misdrawn(points, body, every, passes)) or _why_none(every, body)
     if doubtful:
         images = [one for pose in found for one in search.images(pose) if passes(one)]
         if not (found := search.unrivalled(found, images)):
@@ -266,6 +269,16 @@ def _passes(
         and verdict.bounded
         and verdict.goes_on <= goes_on * verdict.beside
         and found.weakest <= weakest
+    )
+
+
+def _unsure(found: FoundPose, body: TargetBody) -> Rejected:
+    """Return the rejection of a scan that shows a body, but not exactly enough where it is."""
+    return Rejected(
+        f"{body.name} may be in view, but the scan leaves its pose or size too uncertain: show "
+        "more of it, scan from nearer or with less noise, or use a larger body",
+        f"standard deviation {found.weakest * body.size * 1e3:.1f} mm, limit "
+        f"{FIRM * body.size * 1e3:.1f} mm",
     )
 
 

@@ -422,6 +422,17 @@ def test_a_mesh_of_ones_own_goes_with_the_run(tmp_path: Path) -> None:
     assert again.context[TargetBody].digest == recipe.context[TargetBody].digest
 
 
+def test_a_scan_too_coarse_for_a_body_says_so() -> None:
+    """Of a gripper seen end on, whose length hardly shows, and not that its mesh is wrong."""
+    far = rigid(rotation_from_rpy(3.1, 0.0, 0.0), np.array([0.03, -0.02, 1.35]))
+    gripper = SolidBody(Mesh(GRIPPER.vertices, GRIPPER.triangles).moved(far), MATERIALS["matt"])
+    wall = SolidBody(box([-1, -1, 1.65], [1, 1, 1.67]), MATERIALS["table"])
+    xyz = eye("azure-kinect", 1.0).scan(RaycastScene([gripper, wall]), np.random.default_rng(0))
+    refused = found(Capture("0000", PointCloud(CAMERA, xyz), {}))
+    assert isinstance(refused, Rejected)
+    assert "leaves its pose or size too uncertain: show more of it" in refused.reason
+
+
 def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
     """A ring plate laid 1.4 mm aside, where its surfaces fit as well."""
     rng = np.random.default_rng(23)
