@@ -176,12 +176,13 @@ class Dataset:
         return kept, places
 
     def _read(self, name: str) -> pa.Table:
-        """Return a part; no rows if it is torn, or has other columns."""
+        """Return a part; no rows if it is torn or damaged, or has other columns."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         try:
             table = pq.read_table(io.BytesIO(self._place.read(name) or b""))
+            table.validate(full=True)  # text that is no UTF-8 fails only when it is looked at
         except (pa.ArrowException, OSError):
             return self._schema.empty_table()
         return table if table.schema == self._schema else self._schema.empty_table()
