@@ -185,7 +185,7 @@ def test_an_arm_that_never_arrives_is_noticed() -> None:
     robot = GoesHalfWay()
     with watched(driver_of(robot), MODEL, LIMITS) as arm:
         arm.go(way_to(arm, j1=0.3))
-        with pytest.raises(DeviceError, match="the arm ended its move .* before the goal"):
+        with pytest.raises(DeviceError, match="the arm stopped .* before the goal"):
             arm.wait()
 
 

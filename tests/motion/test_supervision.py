@@ -192,7 +192,7 @@ def test_three_tenths_of_a_second_on_the_way_without_a_move_and_no_longer() -> N
     watch.judge(moving_on)
     watch.judge(at(1.31, halfway))
     watch.judge(at(1.609, halfway))
-    with pytest.raises(SafetyFault, match=r"the arm ended its move 11\.5 deg before the goal: its"):
+    with pytest.raises(SafetyFault, match=r"the arm stopped 11\.5 deg before the goal: its"):
         watch.judge(at(1.611, halfway))
     watch.set_off(Leg(GOAL, 0.1, 0.1, 4.0))
     watch.judge(at(1.7, GOAL))
@@ -224,7 +224,7 @@ def test_the_bound_itself_is_not_near_the_goal_and_a_bound_s_speed_is_rest() -> 
     watch, beside = from_zero(FAR), np.array([NEAR, 0.4, 0.0, 0.0, 0.0, 0.0])
     for seconds in (3.0, 3.1, 3.3):
         assert not watch.judge(at(seconds, beside))
-    with pytest.raises(SafetyFault, match="the arm ended its move 0.1 deg before the goal"):
+    with pytest.raises(SafetyFault, match="the arm stopped 0.1 deg before the goal"):
         watch.judge(at(3.301, beside))
     watch = from_zero(FAR)
     watch.judge(at(3.0, np.array(FAR), 1e-3))
