@@ -10,9 +10,12 @@ import os
 import select
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import zlib
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -431,3 +434,127 @@ def test_the_dashboard_is_asked_five_times_a_second_and_again_after_a_failure(
     with pytest.raises(Over):
         worker.RemoteControl("10.0.0.1", cell.commander).run()
     assert remote == [1, 0, 0, -1]
+
+
+# --- the process ----------------------------------------------------------------------------------
+
+LIBRARY = """
+class Interface:
+    def __init__(self, host):
+        if host == "nobody":
+            raise RuntimeError("no controller\\n   there")
+        if host == "?":
+            raise RuntimeError
+        self.host = host
+    def isConnected(self):
+        return True
+    def getTimestamp(self):
+        return 1.0
+    def getRuntimeState(self):
+        return 2
+    def getRobotMode(self):
+        return 7
+    def getSafetyMode(self):
+        return 1
+    def getActualQ(self):
+        return [0.5] * 6
+    getActualQd = getActualTCPPose = getActualTCPForce = getActualQ
+    def getAsyncOperationProgressEx(self):
+        return self
+    def operationId(self):
+        return 1
+    def isAsyncOperationRunning(self):
+        return False
+    def __getattr__(self, name):
+        def called(*given):
+            if name != "kickWatchdog":
+                print(name, *given, flush=True)
+            return True
+        return called
+"""
+
+
+class Process:
+    """The worker as a process of its own, with a stand-in for the library."""
+
+    def __init__(self, folder: Path, host: str, *reads: str) -> None:
+        for name, its in (("receive", "Receive"), ("control", "Control")):
+            if name == "receive" or not reads:  # what only reads imports no more than that
+                code = f"{LIBRARY}\n\nRTDE{its}Interface = Interface\n"
+                (folder / f"rtde_{name}.py").write_text(code)
+        self.line, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.line.settimeout(30.0)
+        self._memory = os.memfd_create("samples")
+        os.ftruncate(self._memory, worker.MEMORY)
+        passed = (self._memory, theirs.fileno())
+        words = [sys.executable, worker.__file__, host, "0.25", *map(str, passed), *reads]
+        self._child = subprocess.Popen(
+            words, pass_fds=passed, env={"PYTHONPATH": str(folder)}, stdout=subprocess.PIPE,
+            text=True,
+        )  # fmt: skip
+        theirs.close()
+
+    def asks(self, **request: Any) -> Any:
+        self.line.send(json.dumps(request).encode())
+        return self.says()
+
+    def says(self) -> Any:
+        return json.loads(self.line.recv(4096))
+
+    def sample(self) -> Any:
+        while not (raw := os.pread(self._memory, SAMPLE.size, 0))[0]:
+            assert self._child.poll() is None
+        return SAMPLE.unpack(raw)
+
+    def ends(self) -> tuple[int, list[str]]:
+        """Let the process end; return its exit code, and what it told the library."""
+        self.line.close()
+        told, _ = self._child.communicate(timeout=30.0)
+        os.close(self._memory)
+        return self._child.returncode, told.splitlines()
+
+
+def test_the_process_serves_its_owner_and_stops_the_arm_when_that_is_gone(tmp_path: Path) -> None:
+    process = Process(tmp_path, "127.0.0.9")
+    assert process.says() == {"ok": True, "given": None}
+    count, _, *modes = process.sample()[:7]
+    assert (count, modes) == (1, [7, 1, 2, -1, 0])  # whether its control is remote is not known yet
+    asked = process.asks(do="move_velocity", twist=TWIST, acceleration=0.4)
+    assert asked == {"ok": True, "given": None}
+    code, told = process.ends()
+    assert (code, told) == (
+        0,
+        ["setWatchdog 5.0", f"speedL {TWIST} 0.4 0.25", "speedStop 4.0", "stopScript"],
+    )
+
+
+def test_a_process_that_only_reads_does_without_the_command_library(tmp_path: Path) -> None:
+    process = Process(tmp_path, "127.0.0.9", "read")
+    assert process.says() == {"ok": True, "given": None}
+    assert process.sample()[7:] == (0.5,) * 24
+    assert process.ends() == (0, [])
+
+
+@pytest.mark.parametrize(
+    ("host", "why"), [("nobody", "no controller there"), ("?", "RuntimeError")]
+)
+def test_a_process_without_a_controller_says_why_in_one_line(
+    tmp_path: Path, host: str, why: str
+) -> None:
+    process = Process(tmp_path, host)
+    assert process.says() == {"ok": False, "error": why}
+    assert process.ends() == (1, [])
+
+
+def test_the_process_asks_for_the_lowest_real_time_priority_and_does_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+
+    def refused(*given: Any) -> None:
+        asked.append(given)
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refused)
+    worker.take_realtime_priority()
+    assert asked == [(0, os.SCHED_FIFO, os.sched_param(1))]  # 0 is this process

@@ -59,8 +59,7 @@ class SampleClock:
     """
 
     def __init__(self) -> None:
-        self._offset = math.inf
-        self._last = 0.0
+        self._offset, self._last = math.inf, -math.inf
 
     def sampled(self, controller: float, arrived: float) -> float:
         """Return this computer's time of a sample with the controller's time ``controller`` [s]."""
@@ -85,7 +84,7 @@ class Publisher(threading.Thread):
         super().__init__(daemon=True)
         self._receive, self._commander = receive, commander
         self._memory, self._period = memory, period
-        self._clock, self._count, self._last = SampleClock(), 0, -1.0
+        self._clock, self._count, self._last = SampleClock(), 0, -math.inf
         self._owner = os.getppid()
 
     def run(self) -> None:
@@ -145,7 +144,7 @@ class Commander:
         self.remote = -1
         self._memory, self._answered = memory, time.monotonic()
         self._control, self._receive, self._period = control, receive, period
-        self._operation, self._commanded = -1, -math.inf
+        self._operation, self._commanded = None, -math.inf
         self._velocity_until = -math.inf
         self._stopping: Callable[[float], Any] = control.stopL
 
