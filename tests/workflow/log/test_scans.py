@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from flangeye import types as t
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder
-from flangeye.workflow.log.records import POINTS_AT_ONCE, pack, unpack
+from flangeye.workflow.log.records import pack, unpack
 
 
 def scan(rows=300, columns=400):
@@ -28,12 +28,26 @@ def scan(rows=300, columns=400):
 @settings(max_examples=40)
 @given(
     arrays.arrays(np.uint32, st.integers(0, 40)),
-    st.sampled_from([0, 1, POINTS_AT_ONCE - 1, POINTS_AT_ONCE]),
+    st.sampled_from([0, 1, 2047, 2048]),
 )
 def test_every_bit_comes_back(bits: Any, more: Any) -> None:
     flat = np.resize(bits, 3 * (len(bits) + more)).astype(np.uint32).view(np.float32)
     points = flat.reshape(-1, 3)
     assert unpack(pack(points), points.shape).tobytes() == points.tobytes()
+
+
+@pytest.mark.parametrize("points", [0, 1, 2047, 2048, 2049, 4096, 5000])
+def test_of_2048_points_at_once_the_first_bytes_stand_side_by_side_then_the_second(
+    points: int,
+) -> None:
+    """So are the scans of logs that exist: what is written otherwise cannot be read with them."""
+    xyz = np.random.default_rng(points).normal(size=(points, 3)).astype("<f4")
+    raw = xyz.tobytes()
+    blocks = [raw[at : at + 12 * 2048] for at in range(0, len(raw), 12 * 2048)]
+    planes = b"".join(block[byte::12] for block in blocks for byte in range(12))
+    assert zstandard.decompress(pack(xyz)) == planes
+    back = unpack(zstandard.compress(planes), xyz.shape)
+    assert back is not None and back.tobytes() == raw
 
 
 def test_it_is_smaller_than_the_points_by_zstandard() -> None:

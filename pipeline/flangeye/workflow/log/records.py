@@ -313,9 +313,10 @@ def pack(xyz: Singles) -> bytes:
     """Return points (..., 3) in few bytes, bit for bit."""
     import zstandard
 
-    points = np.ascontiguousarray(xyz, dtype="<f4").reshape(-1, 3).view(np.uint8)
+    flat = np.ascontiguousarray(xyz, dtype="<f4").reshape(-1).view(np.uint8)
+    planes = b"".join(block.reshape(-1, POINT_BYTES).T.tobytes() for block in _blocks(flat))
     # of zstandard: the fast levels lose three hundredths of the size
-    return zstandard.compress(_turned(points, (POINTS_AT_ONCE, POINT_BYTES)).data, level=-8)
+    return zstandard.compress(planes, level=-8)
 
 
 def unpack(packed: bytes, shape: Sequence[int]) -> Singles | None:
@@ -332,22 +333,12 @@ def unpack(packed: bytes, shape: Sequence[int]) -> Singles | None:
         return None
     if len(planes) != size or size % POINT_BYTES:
         return None
-    return (
-        _turned(np.frombuffer(planes, np.uint8), (POINT_BYTES, POINTS_AT_ONCE))
-        .view("<f4")
-        .reshape(shape)
-    )
+    blocks = _blocks(np.frombuffer(planes, np.uint8))
+    points = np.concatenate([block.reshape(POINT_BYTES, -1).T.ravel() for block in blocks])
+    return points.view("<f4").reshape(shape)
 
 
-def _turned(flat: Bytes, block: tuple[int, int]) -> Bytes:
-    """Return each block of bytes, and the shorter rest, with rows and columns exchanged."""
-    flat, out = flat.reshape(-1), np.empty(flat.size, dtype=np.uint8)
-    whole = len(flat) // (POINTS_AT_ONCE * POINT_BYTES) * POINTS_AT_ONCE * POINT_BYTES
-    rows, columns = block
-    out[:whole].reshape(-1, columns, rows)[:] = (
-        flat[:whole].reshape(-1, rows, columns).transpose(0, 2, 1)
-    )
-    rest = (len(flat) - whole) // POINT_BYTES
-    rows, columns = (rest if side == POINTS_AT_ONCE else side for side in block)
-    out[whole:].reshape(columns, rows)[:] = flat[whole:].reshape(rows, columns).T
-    return out
+def _blocks(flat: Bytes) -> list[Bytes]:
+    """Return the bytes of so many points at once, the last block the rest."""
+    block = POINTS_AT_ONCE * POINT_BYTES
+    return np.split(flat, range(block, len(flat), block))
