@@ -268,8 +268,10 @@ class Wire:
 
     def __init__(self, robot, requests):
         self.robot, self.requests, self.heard = robot, requests, []
+        self.waited = set[float]()
 
     def poll(self, seconds):
+        self.waited.add(seconds)
         return bool(self.requests) and self.requests[0][0] <= self.robot.cycles
 
     def recv(self):
@@ -553,3 +555,4 @@ def test_the_legs_of_a_way_are_driven_one_after_the_other() -> None:
     assert [r.what for r in wire.heard if r.what != "state"] == ["opened", "arrived"]
     assert robot.commands() == ["move", "move"]
     assert robot.state().joints == pytest.approx(goal, abs=1e-3)
+    assert wire.waited == {0.0}  # a guard that nobody leads waits for the arm alone

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye import types as t
+from flangeye.errors import StageError
 from flangeye.estimation.watch.drift import CheckSightings
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import corners_of
 from flangeye.models.loading import load_model
+from flangeye.plugin.registry import load_registry
 from flangeye.types.geometry import rotation_exp
+from flangeye.workflow.doctor.monitor import from_archive
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
 from tests.workflow.doctor.monitor.cell import WORKSPACE, calibrate
 
@@ -122,3 +126,17 @@ def test_the_key_tells_calibrations_apart_by_a_nanometre(stored: StoredCalibrati
 
     assert moved(0.0) == stored.key != moved(2e-9)
     assert "\n" not in stored.key
+
+
+@pytest.mark.parametrize(
+    "first", ["acquire.archive", "acquire.live", "acquire.live: {poses: 20}", "acquire.archive: {}"]
+)
+def test_later_recordings_are_read_from_an_archive_whatever_the_calibration_took(
+    stored: StoredCalibration, first: str, tmp_path: Path
+) -> None:
+    recipe = f"title: T\nrobot: ur5e\nsteps: [{{{first}}}, segment.flange, fit.rim, solve.svd]"
+    if ":" not in first:
+        recipe = recipe.replace(f"{{{first}}}", first)
+    log = replace(stored.log, attachments={"recipe.resolved.yaml": recipe.encode()})
+    with pytest.raises(StageError, match="no reader knows this layout"):
+        from_archive(tmp_path, replace(stored, log=log), load_registry())

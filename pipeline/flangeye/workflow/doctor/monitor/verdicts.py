@@ -56,14 +56,16 @@ def _without_misfits(
     before = _before(stored, history, test)
     seen = stored.sightings(check.seen, np.zeros(len(check.seen), dtype=np.intp))
     wrong = misfits(seen, before, test)
+    if not wrong.any():
+        return check, ()
     # Two scans that disagree do not show which one is wrong; at most one in three may be
     fewest_scans = 3
-    if 0 < fewest_scans * wrong.sum() <= len(wrong):
+    if fewest_scans * wrong.sum() <= len(wrong):
         fine = tuple(o for o, bad in zip(check.seen, wrong, strict=True) if not bad)
         ids = tuple(o.id for o, bad in zip(check.seen, wrong, strict=True) if bad)
         return replace(check, seen=fine), ids
     scanner = stored.estimate.transform.translation
-    if wrong.any() and not explained(before, seen, stored.estimate.about, scanner, test.daily):
+    if not explained(before, seen, stored.estimate.about, scanner, test.daily):
         raise StageError(
             f"{check.source}: nothing is checked: no single change of scanner, flange or arm "
             f"explains its {len(wrong)} scans; inspect them and scan again, or calibrate if the "
