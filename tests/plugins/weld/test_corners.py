@@ -1,6 +1,8 @@
 """Plans with sharp corners: found, refused where the tool has no room, welded leg by leg."""
 
+from dataclasses import replace
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,16 +114,9 @@ def test_a_rounded_corner_is_an_arc_that_touches_both_legs(sampled) -> None:
     assert plan.covariance.shape == (len(plan.points_in_base), 3, 3)
 
 
-@pytest.mark.parametrize(
-    ("turns", "given", "message"),
-    [
-        ((90.0,), {"leg": 1}, "corner_radius leaves no legs; leave out one"),
-        ((90.0, 90.0), {"corner_radius": 0.04}, "no room .* of 40 mm, at most 30 mm"),
-    ],
-)
-def test_a_corner_that_cannot_be_rounded_is_refused(turns, given, message: str) -> None:
-    with pytest.raises(StageError, match=message):
-        leg_of(seam_of(polyline(*turns)), told(**{**ROUND, **given}))
+def test_a_plan_with_rounded_corners_has_no_legs() -> None:
+    with pytest.raises(StageError, match="corner_radius leaves no legs; leave out one"):
+        leg_of(seam_of(polyline(90.0)), told(**{**ROUND, "leg": 1}))
 
 
 @pytest.mark.parametrize("turn", [45.0, pytest.param(-45.0, marks=pytest.mark.slow)])
@@ -220,42 +215,51 @@ def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: 
     assert np.sqrt(np.mean(across[beside] ** 2)) < 0.1e-3
 
 
-@pytest.mark.parametrize(("last", "corners"), [(0.0049, 0), (0.0051, 1)])
-def test_a_corner_nearer_to_an_end_than_five_millimetres_is_none(last: float, corners: int) -> None:
-    points = np.array([[0.0, 0, 0], [0.06, 0, 0], [0.06, last, 0]])
+def legs(turn: float, *lengths: float) -> Points:
+    """Legs of these lengths, turning to the left by so much between them [deg]."""
+    headings = np.radians(turn) * np.arange(len(lengths))
+    steps = np.array(lengths)[:, None] * np.stack(
+        [np.cos(headings), np.sin(headings), 0 * headings], axis=1
+    )
+    return np.concatenate([[[0.0, 0, 0]], np.cumsum(steps, axis=0)])
+
+
+@pytest.mark.parametrize(
+    ("turn", "lengths", "corners"),
+    [
+        # More than 35 deg within ten millimetres, not nearer to an end than a chord
+        (34.0, (0.06, 0.06), 0), (36.0, (0.06, 0.06), 1), (-34.0, (0.06, 0.06), 0),
+        (-36.0, (0.06, 0.06), 1), (90.0, (0.06, 0.0049), 0), (90.0, (0.06, 0.0051), 1),
+        # Bends that near to each other are one corner
+        (30.0, (0.05, 3e-3, 0.05), 1), (30.0, (0.05, 14e-3, 0.05), 0),
+        (60.0, (0.05, 9e-3, 0.05), 1), (60.0, (0.05, 11e-3, 0.05), 2),
+    ],
+)  # fmt: skip
+def test_what_a_corner_is(turn: float, lengths: tuple[float, ...], corners: int) -> None:
+    points = legs(turn, *lengths)
     for way in (points, points[::-1]):
         assert len(corners_of(way)) == corners
 
 
-@pytest.mark.parametrize(("side", "turn"), [("left", 60.0), ("right", -60.0)])
-def test_round_the_outside_of_the_plate_that_is_pressed_the_finger_has_room(
-    side: str, turn: float
-) -> None:
-    leg = leg_of(seam_of(polyline(turn)), told(leg=1, side=side))
-    assert leg.points_in_base == pytest.approx(polyline(turn)[:2])
-    with pytest.raises(StageError, match="would run into a wall"):
-        leg_of(seam_of(polyline(-turn)), told(leg=1, side=side))
-
-
-@pytest.mark.parametrize(("turn", "corners"), [(34.0, 0), (36.0, 1), (-34.0, 0), (-36.0, 1)])
-def test_a_plan_that_turns_by_more_than_35_degrees_within_ten_millimetres_has_a_corner(
-    turn: float, corners: int
-) -> None:
-    assert len(corners_of(polyline(turn))) == len(corners_of(dense(polyline(turn)))) == corners
-
-
 @pytest.mark.parametrize(
-    ("turn", "apart", "corners"),
-    [(30.0, 3e-3, 1), (30.0, 14e-3, 0), (60.0, 9e-3, 1), (60.0, 11e-3, 2)],
-)
-def test_bends_within_ten_millimetres_are_one_corner(
-    turn: float, apart: float, corners: int
+    ("turn", "given", "room"),
+    [
+        (60.0, {"side": "left"}, True), (-60.0, {"side": "right", "joint": "fillet"}, True),
+        (-60.0, {"side": "left"}, False), (60.0, {"side": "right"}, False),
+        (60.0, {"joint": "groove"}, False), (60.0, {"half_angle": 0.7}, False),
+    ],
+)  # fmt: skip
+def test_round_the_outside_of_the_plate_that_is_pressed_the_finger_has_room(
+    turn: float, given: dict[str, Any], room: bool
 ) -> None:
-    headings = np.radians([0.0, turn, 2 * turn])
-    steps = np.array([0.05, apart, 0.05])[:, None] * np.stack(
-        [np.cos(headings), np.sin(headings), 0 * headings], axis=1
-    )
-    assert len(corners_of(np.concatenate([[[0.0, 0, 0]], np.cumsum(steps, axis=0)]))) == corners
+    seam = replace(seam_of(polyline(turn)), half_angle=given.pop("half_angle", None))
+    for leg in (1, 2):
+        if room:
+            kept = leg_of(seam, told(leg=leg, **given)).points_in_base
+            assert kept == pytest.approx(polyline(turn)[leg - 1 : leg + 1])
+            continue
+        with pytest.raises(StageError, match="would run into a wall"):
+            leg_of(seam, told(leg=leg, **given))
 
 
 @pytest.mark.parametrize(("radius", "room"), [(29.9e-3, True), (30.1e-3, False)])

@@ -44,19 +44,38 @@ def test_a_seated_ball_is_one_radius_away_from_both_walls(half_angle: float, lea
     np.testing.assert_allclose([left, right], RADIUS)
 
 
-def test_the_seat_moves_with_a_wall_as_its_slope_says() -> None:
-    fillet = joint_of("fillet", None, 1.0, RADIUS, 0.0)
-    assert fillet is not None
-    np.testing.assert_allclose([fillet.left, fillet.right], [0.0, np.pi / 2], atol=1e-12)
-    wider = WeldJoint(fillet.half_angle + 5e-4, fillet.lean + 5e-4)  # the left wall by 1 mrad
-    moved = wider.seat(RADIUS)[0] - fillet.seat(RADIUS)[0]
-    assert abs(moved) == pytest.approx(1e-3 * fillet.seat_slope(RADIUS), rel=0.01)
+@pytest.mark.parametrize(("half_angle", "lean"), [(0.7, 0.3), (0.5, -0.4), (np.pi / 4, -np.pi / 4)])
+def test_a_seat_moves_with_either_wall_by_no_more_than_is_stated(
+    half_angle: float, lean: float
+) -> None:
+    joint, step = WeldJoint(half_angle, lean), 1e-7
+    seats = [WeldJoint(half_angle + step / 2, lean + s * step / 2).seat(RADIUS)[0] for s in (1, -1)]
+    most = np.abs(np.array(seats) - joint.seat(RADIUS)[0]).max() / step
+    assert joint.seat_slope(RADIUS) == pytest.approx(most, rel=1e-4)
 
 
-def test_the_plan_knows_better_than_the_kind_of_joint() -> None:
-    assert joint_of("fillet", 0.7, 1.0, RADIUS, 0.0) == WeldJoint(0.7)
-    assert joint_of("groove", None, 1.0, RADIUS, 0.0) is None
-    assert edges_half_angle(np.sqrt(2) * RADIUS, RADIUS) == pytest.approx(np.pi / 4)
+@pytest.mark.parametrize(
+    ("kind", "half_angle", "side", "gap", "walls"),
+    [
+        ("fillet", None, 1.0, 0.0, (0, 90)), ("lap", None, -1.0, 0.0, (90, 0)),
+        ("corner", None, 1.0, 0.0, (45, 45)), ("groove", None, 1.0, 1e-3, None),
+        ("fillet", np.radians(40), 1.0, 0.0, (40, 40)),  # the plan knows better
+        ("butt", None, 1.0, 0.0, None), ("butt", None, 1.0, 2 * RADIUS, None),
+        ("butt", None, 1.0, np.sqrt(2) * RADIUS, (45, 45)),
+    ],
+)  # fmt: skip
+def test_the_walls_of_a_joint_follow_from_its_kind(kind, half_angle, side, gap, walls) -> None:
+    joint = joint_of(kind, half_angle, side, RADIUS, gap)
+    found = None if joint is None else np.degrees([joint.left, joint.right])
+    assert found == (None if walls is None else pytest.approx(walls))
+
+
+def test_a_ball_on_two_edges_climbs_as_steeply_as_in_its_groove() -> None:
+    """About the right edge, with the ball's centre turned from where it touches both."""
+    gap, step = 1e-3, 1e-9
+    up, raised = (np.sqrt(RADIUS**2 - (gap / 2 - aside) ** 2) for aside in (0.0, step))
+    steep = 1 / np.tan(edges_half_angle(gap, RADIUS))
+    assert (raised - up) / step == pytest.approx(steep, rel=1e-4)
 
 
 def test_a_leaning_tool_still_heads_from_its_torch_to_its_tip() -> None:

@@ -13,7 +13,7 @@ from flangeye.motion.seam_following import STILL, Command, ToolPose
 from flangeye.types import Floats
 from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
-from flangeye_plugins.weld.passes import MultiPassController, RootPass, _nearest, _towards
+from flangeye_plugins.weld.passes import MultiPassController, RootPass
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
@@ -147,38 +147,6 @@ def test_between_passes_the_tool_is_lifted_crosses_and_comes_down_where_the_pass
     assert max(abs(row[1].turn) for row in rows[:-1]) <= found._settings.turn_rate
 
 
-@pytest.mark.parametrize(
-    ("off", "there"),
-    [
-        ((0.0, 0.09e-3, 0.0), True),
-        ((0.0, 0.11e-3, 0.0), False),
-        ((0.0, 0.0, 0.19), True),
-        ((0.0, 0.0, -0.21), False),
-    ],
-)
-def test_a_place_is_reached_within_a_tenth_of_a_millimetre_and_a_fifth_of_a_degree(
-    off: Any, there: bool
-) -> None:
-    found = rooted(passes({"up": "3 mm"}))
-    x, y, angle = off
-    above = pose(DISTANCE + x, y, 10e-3, math.radians(angle))
-    command = found._return(above)
-    assert (command.velocity[2] < 0.0) == there  # down, or up to where it may cross
-    for z, phase in ((2.11e-3, "returning"), (2.09e-3, "passing"), (1.91e-3, "passing")):
-        found.phase = "returning"
-        found._return(pose(DISTANCE, 0.0, z, 0.0))
-        assert found.phase == phase
-
-
-def test_a_tool_that_is_off_is_brought_back_at_two_a_second() -> None:
-    found = rooted(passes({"up": "3 mm"}))
-    command = found._return(pose(DISTANCE + 1e-3, -2e-3, 17e-3, 0.05))
-    assert command.velocity == pytest.approx([-2e-3, 4e-3, 0.0], abs=1e-9)
-    assert command.turn == pytest.approx(-0.1)
-    low = found._return(pose(DISTANCE + 1e-3, -2e-3, 11e-3, 0.05))  # lifted first
-    assert low.velocity == pytest.approx([0.0, 0.0, 2 * 6e-3]) and low.turn == 0.0
-
-
 @pytest.mark.parametrize("points", [straight(LENGTH), circle()])
 def test_the_torch_goes_along_its_pass_and_the_passes_after_it_follow(points: Any) -> None:
     found = rooted(
@@ -228,24 +196,6 @@ def test_a_torch_that_is_off_and_a_tool_that_is_askew_are_brought_back() -> None
     assert found.torch == pytest.approx(0.0309)
 
 
-def test_on_a_curve_the_tool_turns_as_the_path_does_and_climbs_with_it() -> None:
-    found = passing(rooted(passes({"up": "3 mm"}, points=circle()), height=0.0))
-    assert found._bend() == pytest.approx(1 / RADIUS, rel=1e-3)
-    place = found._path.at(0.03)
-    heading = math.atan2(place.tangent[1], place.tangent[0])
-    x, y = (place.point + DISTANCE * place.tangent).tolist()
-    command = found._weld(pose(x, y, 3e-3, heading))
-    assert command.turn == pytest.approx(5e-3 / RADIUS, rel=0.02)
-    climbing = passes({"up": "3 mm"})
-    for s in np.arange(0.0, LENGTH + 1e-4, 1e-3).tolist():
-        climbing.root.torch = s
-        climbing.step(pose(s + DISTANCE, z=0.05 * s), [])
-    climbing.root.ends = True
-    climbing.step(pose(LENGTH + DISTANCE, z=0.05 * LENGTH), [])
-    up = passing(climbing)._weld(pose(0.03 + DISTANCE, 0.0, 3e-3 + 0.05 * 0.03)).velocity[2]
-    assert up == pytest.approx(0.05 * 5e-3, rel=0.02)
-
-
 def test_a_pass_is_known_as_the_root_was_and_by_what_arm_and_heat_do_since() -> None:
     asked: dict[str, Any] = {"arm_sigma": "0.04 mm", "distortion": "0.07 mm", "max_error": "1 mm"}
     found = passing(rooted(passes({"weave_width": "2 mm"}, **asked)))
@@ -266,19 +216,6 @@ def test_a_pass_is_known_as_the_root_was_and_by_what_arm_and_heat_do_since() -> 
     assert found.sigma**2 - sigma**2 + SIGMA**2 == pytest.approx((0.5e-3) ** 2, rel=0.02)
 
 
-def test_a_swing_of_a_pass_is_commanded_early_and_stated_as_it_is() -> None:
-    found = rooted(passes({"across": "1 mm", "weave_width": "4 mm"}, weave_frequency=0.5))
-    assert (found._response.dead_time, found._response.lag) == (0.08, 0.05)
-    found._began = 3.0
-    turn, swing = math.pi, found._swayed(3.5)
-    assert swing.aside == pytest.approx(
-        2e-3 * (math.sin(turn * 0.5) + 0.05 * turn * math.cos(turn * 0.5)), abs=1e-9
-    )
-    assert found.aim == pytest.approx(1e-3 + 2e-3 * math.sin(turn * 0.42))
-    found._swayed(3.05)
-    assert found.aim == 1e-3  # the arm is not yet there
-
-
 def test_a_later_pass_is_gone_on_with_where_it_was() -> None:
     first = passing(rooted(passes({}, {"across": "1 mm"})), 0.03)
     kept = first.kept()
@@ -295,19 +232,6 @@ def test_a_later_pass_is_gone_on_with_where_it_was() -> None:
     begun.step(pose(0.06), [])
     assert begun.kept().number == 0 and begun.kept().torch == 0.02
     assert len(begun.kept().traced) == 1
-
-
-@pytest.mark.parametrize(
-    ("angle", "near"), [(0.1, 0.1), (6.2, 6.2 - 2 * math.pi), (-4.0, 2 * math.pi - 4.0)]
-)
-def test_an_angle_is_taken_within_half_a_turn(angle: float, near: float) -> None:
-    assert _nearest(angle) == pytest.approx(near)
-
-
-def test_a_place_is_gone_to_at_a_speed_and_slower_near_to_it() -> None:
-    assert _towards(np.array([3.0, 4.0]), 0.1) == pytest.approx([0.06, 0.08])
-    assert _towards(np.array([3e-3, 4e-3]), 0.1) == pytest.approx([6e-3, 8e-3])
-    assert _towards(np.zeros(2), 0.1) == pytest.approx([0.0, 0.0])
 
 
 def test_a_torch_on_its_swing_goes_on_with_it_and_one_beside_it_is_brought_back() -> None:

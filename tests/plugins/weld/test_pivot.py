@@ -72,13 +72,6 @@ def test_a_motion_that_is_missing_is_named(turns: NDArray[np.float64], message: 
         pivot("torch", [rigid(r, -r @ TORCH) for r in turned])
 
 
-def test_a_point_that_left_its_mark_is_named() -> None:
-    poses = poses_about(TORCH, np.zeros(3))
-    poses[3][:3, 3] += [3e-3, 0.0, 0.0]
-    with pytest.raises(StageError, match=r"in pose 4 it was 2\.\d+ mm away"):
-        pivot("torch", poses)
-
-
 def test_the_covariance_goes_into_the_welds_bound() -> None:
     finger = read_model(Path("data/fingers/srm.yaml").absolute(), Finger)
     tip = Pivot(TIP, np.diag([0.1e-3, 0.2e-3, 0.3e-3]) ** 2, np.zeros(3), 0.0)

@@ -14,7 +14,7 @@ from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits
-from flangeye.motion.route import LARGEST_TURN, NoRoute, Route
+from flangeye.motion.route import NoRoute, Route
 from flangeye_plugins.weld import reachability
 from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool, WorkSurface
@@ -149,16 +149,11 @@ def test_a_chain_is_wound_to_where_the_arm_stands_where_its_limits_let_it() -> N
     assert np.degrees(found._turned_to(here, chain)) == pytest.approx(
         np.array([[170.0, 260.0], [175.0, 250.0]])
     )
-    for last, wound in ((357.0, 357.0), (359.0, -1.0)):
-        chain = np.radians([[0.0, -10.0], [0.0, last - 360.0]])
-        assert np.degrees(found._turned_to(np.radians([0.0, 350.0]), chain))[1, 1] == pytest.approx(
-            wound
-        )
-    for last, wound in ((-357.0, -357.0), (-359.0, 1.0)):
-        chain = np.radians([[0.0, 10.0], [0.0, last + 360.0]])
-        assert np.degrees(found._turned_to(np.radians([0.0, -350.0]), chain))[1, 1] == (
-            pytest.approx(wound)
-        )
+    for sign in (1.0, -1.0):
+        for last, wound in ((357.0, 357.0), (359.0, -1.0)):
+            chain = sign * np.radians([[0.0, -10.0], [0.0, last - 360.0]])
+            turned = found._turned_to(sign * np.radians([0.0, 350.0]), chain)
+            assert np.degrees(turned)[1, 1] == pytest.approx(sign * wound)
 
 
 # --- the way to the start -------------------------------------------------------------------------
@@ -197,46 +192,33 @@ def test_the_way_is_taken_to_the_posture_that_is_nearest_and_free() -> None:
 
 
 @pytest.mark.parametrize(
-    ("over", "down", "touches", "told"),
-    [
-        (None, None, None, None),
-        ("over", None, None, "over"),
-        (None, "down", None, "down"),
-        ("over", "down", "work", "over"),
-        (None, "down", "work", "down"),
-        (None, None, "work", "work"),
-    ],
+    ("over", "down", "touches"),
+    [("", "", ""), ("over", "", ""), ("", "down", "work"), ("", "", "work")],
 )
-def test_a_way_goes_over_and_down_and_what_bars_it_first_is_told(
-    monkeypatch: pytest.MonkeyPatch, over: Any, down: Any, touches: Any, told: Any
+def test_a_way_goes_over_and_down_slowly_and_what_bars_it_first_is_told(
+    monkeypatch: pytest.MonkeyPatch, over: str, down: str, touches: str
 ) -> None:
     asked = list[Any]()
 
     class Router:
         def __init__(self, model: Any, limits: Any, here: Any) -> None:
-            asked.append(limits)
+            asked.append((limits.speed, limits.joint_speed))
 
         def route(self, start: Any, goal: Any) -> Any:
-            why = over if goal == "high" else down
             assert (start, goal) in (("here", "high"), ("high", "low"))
+            why = over if goal == "high" else down
             return NoRoute(why) if why else Route((goal,))
 
     monkeypatch.setattr(reachability, "Router", Router)
-    full = np.full(2, 9.0)
-    kept: Any = MotionLimits.__new__(MotionLimits)
-    for name in MotionLimits.__dataclass_fields__:
-        object.__setattr__(kept, name, full)
+    box, params = np.zeros(3), SimpleNamespace(approach_speed=0.1, approach_joint_speed=0.2)
     for given, slower in ((0.01, 0.01), (0.3, 0.1)):
-        object.__setattr__(kept, "speed", given)
-        object.__setattr__(kept, "joint_speed", 2 * given)
-        params = SimpleNamespace(approach_speed=0.1, approach_joint_speed=0.2)
-        found = reach_of(model=None, limits=kept, params=params)
+        allowed = MotionLimits(box, box, given, 0.0, 2 * given, box, box)
+        found = reach_of(model=None, limits=allowed, params=params)
         found._touches = lambda start, goal: NoRoute(touches) if touches else None
         way = found._way("here", "high", "low")
-        assert (way.reason if isinstance(way, NoRoute) else None) == told
-        if told is None:
-            assert way.legs == ("high", "low")
-        assert (asked[-1].speed, asked[-1].joint_speed) == (slower, 2 * slower)
+        assert getattr(way, "reason", "") == (over or down or touches)
+        assert over or down or touches or way.legs == ("high", "low")
+        assert asked[-1] == (slower, pytest.approx(2 * slower))
 
 
 def test_neither_finger_nor_torch_comes_nearer_to_the_work_than_nine_tenths_of_the_clearance() -> (
@@ -258,17 +240,6 @@ def test_neither_finger_nor_torch_comes_nearer_to_the_work_than_nine_tenths_of_t
     found._arm = SimpleNamespace(flange=lambda postures: np.abs(postures[:, 0]))
     told = found._touches(np.array([-1.0]), np.array([1.001]))  # between them it is at the work
     assert told is not None
-    steps = list[Any]()
-
-    def seen(postures: Any) -> Any:
-        steps.append(postures)
-        return postures[:, 0]
-
-    found._arm = SimpleNamespace(flange=seen)
-    found._touches(np.array([0.1, 0.0]), np.array([0.2, -1.0]))
-    ways = steps[0]
-    assert ways[0] == pytest.approx([0.1, 0.0]) and ways[-1] == pytest.approx([0.2, -1.0])
-    assert np.abs(np.diff(ways, axis=0)).max() <= LARGEST_TURN
 
 
 # --- the poses that are looked at -----------------------------------------------------------------
@@ -303,15 +274,3 @@ def test_the_seam_is_looked_at_from_above_its_start_to_where_the_torch_comes_to_
     assert 0.1 + FINGER.torch - 10e-3 <= along[-1] < 0.1 + FINGER.torch + 1e-9
     assert places[count:, 1:] == pytest.approx(0.0, abs=1e-9)
     assert stations[count + 3].name == "30 mm along the seam (the tip goes on beyond its end)"
-
-
-def test_later_passes_may_swing_and_go_back_faster_than_the_root_pass_goes() -> None:
-    turning = Following.model_validate({}).turn_rate * math.hypot(*FINGER.tip[:2])
-
-    def going(**given: Any) -> float:
-        return flange_speed(FINGER, Following.model_validate(given)) - turning
-
-    one, swing = {"weave_width": "9 mm"}, math.pi * 1.5 * 9e-3
-    assert going() == pytest.approx(math.sqrt(25 + 25 + 25) * 1e-3)
-    assert going(weave_frequency=1.5, passes=[{}, one]) == pytest.approx(math.hypot(5e-3, swing))
-    assert going(passes=[{}]) == pytest.approx(math.sqrt(2) * 20e-3)

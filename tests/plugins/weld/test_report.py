@@ -151,10 +151,15 @@ def test_a_weld_that_ended_before_its_first_cycle_says_why() -> None:
     assert report.time.shape == (0,) and report.tip.shape == report.torch.shape == (0, 3)
 
 
-def test_a_weld_of_one_cycle_has_no_period() -> None:
-    loop = reported(logged(1)).loop
-    assert loop["cycles"] == 1.0 and loop["computing_p99"] == 1e-3
-    assert loop["period_median"] == loop["period_p99"] == 0.0
+def test_a_report_says_how_the_loop_kept_time_which_of_one_cycle_has_no_period() -> None:
+    for count, period in ((1, 0.0), (40, 8e-3)):
+        found = reported(logged(count))
+        assert found.loop == {
+            "cycles": count, "computing_median": 1e-3, "computing_p99": 1e-3,
+            "answering_median": 2e-3, "answering_p99": 2e-3,
+            "period_median": period, "period_p99": period,
+        }  # fmt: skip
+        assert found.figures["turn_max"] == pytest.approx(0.01 * (count - 1))
 
 
 @pytest.mark.parametrize(("torch_sigma", "told"), [(0.3e-3, True), (0.0, False)])

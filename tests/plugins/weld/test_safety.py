@@ -21,7 +21,6 @@ from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from tests.motion.stand_in import LIMITS, StandIn
 from tests.motion.stand_in import MODEL as STAND_IN
-from tests.plugins.weld.bench import straight
 from tests.plugins.weld.cell import HOME, MODEL, planned, run
 
 FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
@@ -166,27 +165,35 @@ def test_a_tip_that_strays_from_the_plan_is_stopped(monkeypatch: pytest.MonkeyPa
 # --- the tip's own bounds -------------------------------------------------------------------------
 
 
-def check(displacement, lateral=0.0):
-    bounds = Bounds(FINGER, Path(straight()))
-    felt = TipDisplacement(0, np.array(displacement), np.zeros(3), np.eye(3), 1.0)
-    bounds.check(ToolPose(0.0, np.array([0.05, lateral, 0.0]), 0.0), 0.05, [felt])
-
-
-def test_what_a_weld_needs_is_within_the_bounds() -> None:
-    check([0.0, 2e-3, 1.5e-3], 15e-3)
+ALONG, LEFT, START = np.array([0.6, 0.8]), np.array([-0.8, 0.6]), np.array([0.5, -0.3])
+"""A plan on a slope to the axes, half a metre away from their origin."""
 
 
 @pytest.mark.parametrize(
     ("displacement", "lateral", "told"),
     [
+        ([0.0, 2e-3, 1.5e-3], 15e-3, None),
+        ([0.0, 0.0, 0.0], -20e-3, None),
         ([0, 0, 0], 21e-3, "the tip is 21 mm away from the plan, limit 20 mm"),
+        ([0, 0, 0], -21e-3, "the tip is 21 mm away from the plan, limit 20 mm"),
         ([0, 0, 5.5e-3], 0.0, "the tip presses with 11.0 N, limit 10 N"),
         ([0, 6.1e-3, 0], 0.0, "the tip is displaced by 6.1 mm, limit of finger srm 6 mm"),
     ],
 )
-def test_beyond_the_bounds(displacement: list[Any], lateral: float, told: str) -> None:
+@pytest.mark.parametrize("ahead", [0.0, 5e-3])
+def test_a_tip_keeps_to_the_plan_and_to_what_its_finger_stands(
+    displacement: list[Any], lateral: float, told: str | None, ahead: float
+) -> None:
+    """What it is ahead of its progress by is not astray."""
+    bounds = Bounds(FINGER, Path(np.array([[*START, 0.0], [*(START + 0.1 * ALONG), 0.0]])))
+    felt = TipDisplacement(0, np.array(displacement), np.zeros(3), np.eye(3), 1.0)
+    place = START + (0.05 + ahead) * ALONG + lateral * (1 - 1e-12) * LEFT
+    pose = ToolPose(0.0, np.array([*place, 9.0]), 0.0)
+    if told is None:
+        bounds.check(pose, 0.05, [felt, felt])
+        return
     with pytest.raises(DeviceError) as error:
-        check(displacement, lateral)
+        bounds.check(pose, 0.05, [felt])
     assert str(error.value) == told
 
 

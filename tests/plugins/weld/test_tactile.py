@@ -1,5 +1,7 @@
 """weld.tactile: an arm, a finger with real images, the groove; and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -10,7 +12,6 @@ from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.motion.seam_following import Controller, FollowingTask
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart, part
-from flangeye.types import Seam
 from flangeye_emulators.weld_world.groove import Gap
 from flangeye_emulators.weld_world.truth import ClockTruth, WeldTruth, WorkpieceTruth
 from flangeye_plugins.weld.settings import WeldTactileParams
@@ -71,76 +72,36 @@ def refused(seam=None, name="v-straight", **more):
     return str(error.value)
 
 
-def test_a_deflection_the_finger_does_not_stand() -> None:
-    assert refused(deflection="7 mm") == (
-        "weld.tactile: a deflection of 7 mm exceeds the limit of finger srm, 6 mm"
-    )
+EVERYWHERE = {"centre": ["0 mm", "0 mm", "0 mm"], "size": ["9 m", "9 m", "9 m"]}
+SMALL = {"centre": ["600 mm", "0 mm", "400 mm"], "size": ["220 mm", "600 mm", "600 mm"]}
 
 
-def test_a_force_beyond_the_limit() -> None:
-    assert refused(deflection="4 mm", preload="5 mm") == (
-        "weld.tactile: deflection and preload press with 11 N, limit 10 N; lower them, or "
-        "raise 'largest_force' in its file"
-    )
-
-
-def test_speeds_beyond_the_limits() -> None:
-    assert refused(limits={"speed": "6 mm/s"}) == (
-        "weld.tactile: speed and turn_rate together move the flange at 8.66 mm/s, "
-        "robot.limits.speed allows 6 mm/s"
-    )
-
-
-def test_a_seam_that_is_too_short() -> None:
-    assert refused(planned("v-straight", end=0.015)) == (
-        "weld.tactile: the seam is 14 mm long; inset, ending and release alone take 26 mm"
-    )
-
-
-def test_a_seam_outside_the_workspace() -> None:
-    small = {"centre": ["600 mm", "0 mm", "400 mm"], "size": ["220 mm", "600 mm", "600 mm"]}
-    assert refused(planned("v-straight"), box=small) == (
-        "weld.tactile: 220 mm along the seam (the tip goes on beyond its end), the flange is "
-        "outside the box: x is 718 mm, allowed 490 to 710 mm (robot.limits.box)"
-    )
-
-
-def test_a_seam_out_of_reach() -> None:
-    far = planned("v-straight", shift=(0.9, 0.0, 0.0), end=SHORT)
-    everywhere = {"centre": ["0 mm", "0 mm", "0 mm"], "size": ["9 m", "9 m", "9 m"]}
-    assert "the ur10e cannot reach the seam" in refused(far, box=everywhere)
-
-
-def arc(radius, turn=np.pi):
-    angle = np.linspace(0.0, turn, 200)
-    points = radius * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1)
-    points += [0.6, 0.0, 0.264]
-    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    return Seam(points, up, np.tile(np.eye(3) * 1e-8, (len(points), 1, 1)))
-
-
-def test_a_seam_too_curved_for_the_tool() -> None:
-    told = refused(arc(0.0215, 2 * np.pi))
-    assert told.startswith(
-        "weld.tactile: the seam is too curved for a torch 40 mm behind the tip: the tool would "
-        "stand at 6"
-    )
-    assert "deg to it, limit 60 deg; end the plan before the bend, or take a tool" in told
-
-
-def test_a_seam_that_bends_out_of_its_surface() -> None:
-    seam = planned("v-straight", end=SHORT)
-    hump = np.array(seam.points_in_base)
-    turn = np.linspace(-1.0, 1.0, len(hump))
-    hump[:, 2] += 0.03 * (np.cos(turn) - 1.0)
-    hump[:, :2] = hump[:, :2].mean(axis=0) + 0.03 * np.outer(np.sin(turn), [1.0, 0.0])
-    told = refused(Seam(hump, seam.openings_in_base, seam.covariance))
-    assert "the seam bends out of its surface so much" in told and "limit 30 deg" in told
-
-
-def test_a_plan_too_uncertain_to_search() -> None:
-    told = refused(planned("v-straight", end=SHORT, uncertainty=5e-3))
-    assert told.startswith("weld.tactile: the plan's start is uncertain by 12.2 mm")
+@pytest.mark.parametrize(
+    ("seam", "given", "told"),
+    [
+        ({}, {"deflection": "7 mm"}, "a deflection of 7 mm exceeds the limit of finger srm, 6 mm"),
+        ({}, {"deflection": "4 mm", "preload": "5 mm"},
+         "deflection and preload press with 11 N, limit 10 N; lower them, or raise "
+         "'largest_force' in its file"),
+        ({}, {"preload": "0.1 mm"}, "the tip would climb the wall"),
+        ({}, {"max_error": "0.1 mm"}, "the torch is known to 0."),
+        ({}, {"limits": {"speed": "6 mm/s"}},
+         "speed and turn_rate together move the flange at 8.66 mm/s, robot.limits.speed allows "
+         "6 mm/s"),
+        ({"end": 0.015}, {},
+         "the seam is 14 mm long; inset, ending and release alone take 26 mm"),
+        ({"uncertainty": 5e-3}, {}, "the plan's start is uncertain by 12.2 mm"),
+        ({"end": None}, {"box": SMALL},
+         "220 mm along the seam (the tip goes on beyond its end), the flange is outside the box: "
+         "x is 718 mm, allowed 490 to 710 mm (robot.limits.box)"),
+        ({"shift": (0.9, 0.0, 0.0)}, {"box": EVERYWHERE},
+         "above the seam's start, the ur10e cannot reach the seam"),
+    ],
+)  # fmt: skip
+def test_what_is_known_beforehand_is_refused_beforehand(seam, given, told: str) -> None:
+    half_angle = {"half_angle": np.radians(40.0)} if "preload" in given else {}
+    plan = replace(planned("v-straight", **{"end": SHORT, **seam}), **half_angle)
+    assert refused(plan, **given).startswith(f"weld.tactile: {told}")
 
 
 def test_no_tag_in_view() -> None:

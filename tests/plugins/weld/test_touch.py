@@ -13,7 +13,6 @@ from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Image
-from flangeye.types.geometry import rotation_exp
 from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
 from flangeye_plugins.sensor import (
     ImageFolderParams,
@@ -73,14 +72,6 @@ def test_the_displacement_is_that_of_the_tip() -> None:
         assert felt.confidence > 0.7
 
 
-def test_in_the_base_all_turns_with_the_tool() -> None:
-    felt = Interpreter(FINGER).feel(Eye().reading([1e-3, 0, 0]), 0)
-    quarter = rotation_exp(np.array([0.0, 0.0, np.pi / 2]))
-    in_base = felt.turned_by(quarter)
-    np.testing.assert_allclose(in_base.displacement[1], felt.displacement[0])
-    np.testing.assert_allclose(in_base.covariance[1, 1], felt.covariance[0, 0])
-
-
 def test_another_tag_or_none_is_no_reading() -> None:
     eye = Eye()
     assert eye.reading([1.0, 0.0, 0.0]) is None
@@ -137,27 +128,6 @@ def test_the_calibration_finds_rest_gain_noise_and_stiffness() -> None:
     np.testing.assert_allclose(all_of_it, np.eye(3), atol=0.02)
     assert max(found.noise[:2]) < 20e-6
     assert (found.lateral, found.axial) == pytest.approx((1000.0, 2000.0))
-
-
-def test_without_force_no_stiffness() -> None:
-    rest, held = readings(Eye())
-    found = calibrate(rest, held, "a test")
-    assert found.lateral is None and found.axial is None
-
-
-def test_what_no_calibration_can_be_made_of() -> None:
-    rest, held = readings(Eye())
-    with pytest.raises(StageError, match="the tag was seen 3 times at rest and 36 times held"):
-        calibrate(rest[:3], held, "")
-    flat = [h for h in held if h.displacement[2] == 0.0]
-    with pytest.raises(StageError, match="did not move the finger along all three axes"):
-        calibrate(rest, flat, "")
-    slid = [
-        HeldReading(h.reading, h.displacement * rng)
-        for h, rng in zip(held, np.tile([1, 3], 99), strict=False)
-    ]
-    with pytest.raises(StageError, match="did the tip slide in its mark"):
-        calibrate(rest, slid, "")
 
 
 def test_a_finger_that_was_never_calibrated() -> None:
