@@ -92,6 +92,22 @@ def test_what_a_camera_on_the_arm_sees_is_in_base_by_the_arm_s_pose(tmp_path: Pa
         np.testing.assert_allclose(points, (pose @ carried).apply(xyz), atol=1e-6)
 
 
+def test_of_each_flange_in_base_four_thousand_points_are_shown(tmp_path: Path) -> None:
+    place = t.Transform(t.BASE, t.CAMERA, np.eye(4))
+    recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
+    for points in (4_000, 4_001, 8_000):
+        cloud, name = t.PointCloud(t.CAMERA, np.ones((points, 3), np.float32)), str(points)
+        seen = t.FlangeCloud(cloud, np.zeros(3), np.array([0.0, 0.0, -1.0]))
+        recorder.flangeye_stage_finished("1.segment.toy", name, seen, 0.1)
+    estimate = t.TransformEstimate(place, 1e-8 * np.eye(6), np.zeros(3))
+    recorder.flangeye_stage_finished("3.solve.toy", None, t.HandEye(estimate, (), "toy"), 0.1)
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        logged = list(reader.iter_decoded_messages(topics=["/base/flanges"], log_time_order=False))
+    assert [len(points_of(message)) for _, _, _, message in logged] == [4_000, 2_001, 4_000]
+
+
 def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path: Path) -> None:
     assert flangeye("layout", "foxglove", "--out", tmp_path / "l.json")[0] == 0
     layout = json.loads((tmp_path / "l.json").read_text())
@@ -163,12 +179,16 @@ SEAM = t.Seam(
 
 
 def drawn(update: Any, frame: str) -> list[Any]:
-    """Return the lines (N, 3) of a scene in a frame, after a look at how they are shown."""
+    """Return the lines (N, 3) of a scene in a frame, after a look at how they are shown.
+
+    Circles are orange and seams are blue: whoever sees no red or no green tells them apart.
+    """
+    colour = {"camera": (0.9, 0.3, 0.1), "base": (0.0, 0.45, 0.7)}[frame]
     (entity,) = update.entities
     assert (entity.frame_id, entity.timestamp.ToNanoseconds()) == (frame, 5)
     for line in entity.lines:
         assert line.scale_invariant and line.thickness >= 1.0 and line.color.a == 1.0
-        assert max(line.color.r, line.color.g, line.color.b) <= 1.0
+        assert (line.color.r, line.color.g, line.color.b) == pytest.approx(colour, abs=0.01)
         assert line.pose.orientation.w == 1.0
     return [np.array([[p.x, p.y, p.z] for p in line.points]) for line in entity.lines]
 

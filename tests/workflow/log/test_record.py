@@ -62,6 +62,26 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert np.array_equal(entry.value.centre, CIRCLE.centre)
 
 
+def test_a_log_knows_its_recipe_its_last_joints_and_whether_its_scans_are_whole(
+    tmp_path: Path,
+) -> None:
+    nothing = RunLog(tmp_path / "r.mcap")
+    assert (nothing.has_recipe, nothing.last_joints, nothing.has_full_clouds) == (
+        False,
+        None,
+        False,
+    )
+    for full in (True, False):
+        recorder = recorded(tmp_path / "r.mcap", full)
+        second = replace(CAPTURE, id="b", joints=np.array([0.3, 0.4]))
+        recorder.flangeye_captured("0.acquire.toy", second, 0.1)
+        recorder.close()
+        log = read_run(tmp_path / "r.mcap")
+        assert log.has_recipe and log.has_full_clouds is full
+        assert log.last_joints.tolist() == [0.3, 0.4]
+        (tmp_path / "r.mcap").unlink()
+
+
 def test_names_that_are_no_utf_8_are_written_out_or_replaced(tmp_path: Path) -> None:
     """Python stands half a UTF-16 pair in for such a byte of a folder's or file's name."""
     recorder = Recorder(tmp_path / "r.mcap", {"recipe.yaml": "archive: a\udcff"}, True)

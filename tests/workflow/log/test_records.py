@@ -16,7 +16,7 @@ import pytest
 from pydantic import BaseModel, ValidationError, create_model
 
 from flangeye.errors import StageError
-from flangeye.workflow.log.read import decode_json, read_run
+from flangeye.workflow.log.read import decode_json, is_log, read_run
 from flangeye.workflow.log.records import LogFile, NotMcapError, reason_of
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -242,6 +242,24 @@ def test_a_log_of_another_program_is_told_from_one_of_ours_that_just_begins(tmp_
     assert read_run(path).source is None
     path.write_bytes(MAGIC + header("libmcap 1") + attachment("recipe.yaml", b"title: T") + end())
     assert read_run(path).text("recipe.yaml") == "title: T"
+
+
+@pytest.mark.parametrize(
+    ("name", "begins", "may_be"),
+    [
+        ("run.mcap", MAGIC + header(), True),
+        ("run.mcap", b"damaged", True),
+        ("run.mcap", MAGIC + header("libmcap 1"), False),
+        ("run.mcap", MAGIC + header("libmcap 1") + 55 * b" " + b"flangeye", False),
+        ("run.bag", MAGIC + header(), False),
+    ],
+)
+def test_a_file_may_be_a_log_of_ours_by_its_name_and_first_bytes(
+    tmp_path: Path, name: str, begins: bytes, may_be: bool
+) -> None:
+    assert not is_log(tmp_path / name)
+    (tmp_path / name).write_bytes(begins)
+    assert is_log(tmp_path / name) is may_be
 
 
 def test_a_message_of_more_than_16_mb_is_not_decoded() -> None:

@@ -292,7 +292,7 @@ def test_the_address_behind_the_gate_is_any_of_the_loopback_s(
 
     monkeypatch.setattr("secrets.randbelow", drawn)
     host, port = hidden_address()
-    assert asked == [2**24] and port > 0
+    assert asked == [2**24] and port > 1023  # one that the system chose
     assert host in ("127.1.2.3", "127.0.0.1")  # the second where a system has no other
 
 

@@ -26,11 +26,12 @@ def calibrate(folder: Path, recipe: str = RECIPE) -> Path:
 
 def check(
     folder: Path, seed: int, shift=(0.0, 0.0, 0.0), noise: float = 4e-5, misfit: float = 0.0,
-    recipe: str = "title: x",
+    recipe: str = "title: x", began_ns: int = 10**18,
 ) -> Path:  # fmt: skip
     """Record a check: three scans, the scanner shifted by ``shift`` in base [m].
 
-    In the second one something else was found, by ``misfit`` aside [m].
+    In the second one something else was found, by ``misfit`` aside [m]. The first check ever began
+    at ``began_ns``; 0: no time is known.
     """
     folder.mkdir()
     rng = np.random.default_rng(seed)
@@ -40,9 +41,8 @@ def check(
     for i, pose in enumerate(STATIONS):
         name = f"scan-{i}"
         cloud = t.PointCloud(t.CAMERA, np.zeros((1, 3), np.float32))
-        capture = t.Capture(
-            name, cloud, t.by_frame(pose), time_ns=10**18 + seed * 8 * 3600 * 10**9 + i
-        )
+        when = began_ns + seed * 8 * 3600 * 10**9 + i if began_ns else 0
+        capture = t.Capture(name, cloud, t.by_frame(pose), time_ns=when)
         circle = _circle(camera.inverse() @ pose, rng, noise)
         if i == 1:
             circle = replace(circle, centre=circle.centre + [misfit, 0.0, 0.0])

@@ -335,6 +335,23 @@ def test_a_plc_that_does_not_answer_is_one_line() -> None:
         )
 
 
+def test_a_plc_is_waited_for_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("asyncua", reason="asyncua is not installed")
+    waited: list[float] = []
+
+    async def waits(writing: Any, timeout: float) -> None:
+        writing.close()
+        waited.append(timeout)
+        raise TimeoutError
+
+    monkeypatch.setattr(asyncio, "wait_for", waits)
+    with pytest.raises(StageError, match="cannot be written: TimeoutError$"):
+        write_state(
+            "opc.tcp://127.0.0.1:1", "ns=2;s=x", CheckFinding(0, "OK", 0.0, (0.0,) * 6, None, 0.1)
+        )
+    assert waited == [10]
+
+
 def test_a_plc_on_another_machine_is_written_to_in_the_open_only_when_asked(cell: Path) -> None:
     plc = "opc.tcp://192.0.2.1:4840"
     words = ("--archive", str(cell / "ok-00"), "--opcua", f"{plc},ns=2;s=x")

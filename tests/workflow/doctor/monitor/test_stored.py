@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from flangeye.plugin.registry import load_registry
 from flangeye.types.geometry import rotation_exp
 from flangeye.workflow.doctor.monitor import from_archive
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
-from tests.workflow.doctor.monitor.cell import WORKSPACE, calibrate
+from tests.workflow.doctor.monitor.cell import WORKSPACE, calibrate, check
 
 ARM = Arm(load_model("robots", "ur5e"))
 JOINTS = np.radians([10.0, -125.0, -105.0, -40.0, -90.0, 170.0])
@@ -126,6 +127,16 @@ def test_the_key_tells_calibrations_apart_by_a_nanometre(stored: StoredCalibrati
 
     assert moved(0.0) == stored.key != moved(2e-9)
     assert "\n" not in stored.key
+
+
+@pytest.mark.parametrize("began_ns", [10**18, 0])
+def test_a_check_is_of_the_time_of_its_last_scan_or_else_of_its_log(
+    stored: StoredCalibration, began_ns: int, tmp_path: Path
+) -> None:
+    run = check(tmp_path / "later", 1, began_ns=began_ns)
+    os.utime(run / "run.mcap", ns=(5, 7))
+    last = began_ns + 8 * 3600 * 10**9 + 2 if began_ns else 7
+    assert from_archive(run, stored, load_registry()).time_ns == last
 
 
 @pytest.mark.parametrize(

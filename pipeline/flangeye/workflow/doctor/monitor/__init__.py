@@ -81,7 +81,7 @@ def from_arm(
 
 def _of_log(log: RunLog) -> tuple[list[t.Observation], int]:
     times = [int(meta["time_ns"]) for meta in log.poses.values()]
-    return log.observations(), max(times, default=0) or log.path.stat().st_mtime_ns
+    return log.observations(), max([0, *times]) or log.path.stat().st_mtime_ns
 
 
 def _from_archive(stored: StoredCalibration) -> str:
