@@ -67,7 +67,7 @@ class RunProcess:
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "flangeye.cli", *self.words],
             cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, start_new_session=True, preexec_fn=_die_with_parent,
+            text=True, start_new_session=True, preexec_fn=_heed_the_server,
         )  # fmt: skip
         self.said: list[str] = []
         self._registry, self._fitted = registry, threading.Event()
@@ -233,7 +233,9 @@ class _EndedError(Exception):
     """The run ended and its log will not grow."""
 
 
-def _die_with_parent() -> None:
+def _heed_the_server() -> None:
+    # It is ignored in a server that a shell script starts in the background, and so in its children
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     if sys.platform == "linux":
         # ``PR_SET_PDEATHSIG`` of Linux: a run does not outlive its page's server
         ctypes.CDLL(None).prctl(1, signal.SIGINT)

@@ -379,6 +379,19 @@ def test_a_signal_writes_to_the_alarm_and_what_was_there_before_comes_back() -> 
     assert signal.set_wakeup_fd(before) == before
 
 
+def test_an_arm_heeds_ctrl_c_in_a_program_that_ignores_it() -> None:
+    hears, alarm = multiprocessing.Pipe(duplex=False)
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a shell script's background job
+    try:
+        with pytest.raises(KeyboardInterrupt), _alarmed(alarm):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        assert signal.SIGINT in os.read(hears.fileno(), 4096)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
 def test_an_arm_is_opened_from_the_main_thread_which_alone_hears_of_signals() -> None:
     def opens() -> None:
         with (

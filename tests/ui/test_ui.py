@@ -10,6 +10,7 @@ import json
 import os
 import re
 import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -658,10 +659,14 @@ def test_a_run_that_was_killed_elsewhere_says_how_it_ended(tmp_path: Path) -> No
     assert scan_page.status_line(project.run, True).endswith("_ui ended early (exit code -9).")
 
 
-def test_the_servers_death_ends_its_run(tmp_path: Path) -> None:
+def test_a_closed_page_ends_its_run_though_the_server_ignores_ctrl_c(tmp_path: Path) -> None:
     project = Project(tmp_path, load_registry(), MoveCodes(print))
     project.text = SMALL.replace("0.25", "1.0")
-    project.begin(["run", project.recipe_path.name], "page")
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a shell script's background job
+    try:
+        project.begin(["run", project.recipe_path.name], "page")
+    finally:
+        signal.signal(signal.SIGINT, handler)
     assert project.run is not None and project.run.code is None
     project.page_gone("page")
     assert not project.run.stopped  # nothing moves, so nothing is stopped

@@ -230,10 +230,13 @@ def _alarmed(alarm: Connection) -> Iterator[None]:
         os.set_blocking(alarm.fileno(), False)
         before = signal.set_wakeup_fd(alarm.fileno(), warn_on_full_buffer=False)
         suspending = signal.signal(signal.SIGTSTP, _end_instead)
+        # A shell script starts its background jobs with this one ignored; an arm must heed it.
+        interrupting = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             with _heartbeat():
                 yield
         finally:
+            signal.signal(signal.SIGINT, interrupting)
             signal.signal(signal.SIGTSTP, suspending)
             signal.set_wakeup_fd(before)
 
