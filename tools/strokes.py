@@ -79,7 +79,7 @@ class Terminal:
         self._keys, self._line = pty.openpty()
         self.given: dict[str, Any] = {
             "stdin": self._line, "start_new_session": True,
-            "preexec_fn": lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+            "preexec_fn": _in_its_foreground,
         }  # fmt: skip
 
     def press(self, key: bytes) -> None:
@@ -90,6 +90,11 @@ class Terminal:
         """Close the terminal."""
         os.close(self._keys)
         os.close(self._line)
+
+
+def _in_its_foreground() -> None:
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored in a shell script's background job
 
 
 Stroke = Callable[[int, Terminal], None]
