@@ -34,7 +34,7 @@ def rows(folder):
 
 
 def test_every_end_is_a_row_and_costs_only_itself(
-    batch: Callable[..., Any], tmp_path: Path
+    batch: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker that is killed, too; and the second start goes on where the first ended."""
     grid = ("steps.3.what=die,work,refuse,fail,die once",)
@@ -53,7 +53,13 @@ def test_every_end_is_a_row_and_costs_only_itself(
     more = {"overrides": ("steps.3.once=once",), "workers": 1}
     again, _ = batch(grid=("steps.3.what=work,refuse,fail",), **more)
     assert (again.known, again.tally.total) == (2, 3)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    killed = tmp_path / f"{cluster.PREFIX}{ended.pid}-x"
+    killed.mkdir()
     third, _ = batch(grid=("steps.3.what=work,refuse",), **more)
+    assert not killed.exists()  # a killed batch's, though this one starts no cluster
     assert (third.known, len(rows(third.out))) == (2, 2)
 
 

@@ -17,6 +17,7 @@ from flangeye.workflow.batch.cluster import (
     cores,
     local_client,
     remote_client,
+    remove_forgotten,
     run_all,
     worker_count,
 )
@@ -75,6 +76,7 @@ def run_sessions(
         console: Console for the progress.
     """
     columns = columns_of(varied)
+    remove_forgotten()  # also where nothing is left to do
     at = out if is_url(out) else str(Path(out).absolute())
     job = Job(at, request.report, software, columns)
     dataset, ledger = Dataset(job.place, columns), Ledger(sessions)

@@ -81,8 +81,7 @@ _LOCAL = {
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Make a folder for this process; remove those of processes that have ended."""
-    remove_forgotten()
+    """Make a folder for this process."""
     with tempfile.TemporaryDirectory(
         prefix=f"{PREFIX}{os.getpid()}-", ignore_cleanup_errors=True
     ) as folder:
