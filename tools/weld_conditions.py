@@ -77,19 +77,19 @@ CONDITIONS: Mapping[str, Condition] = {
     "heat: seam moves 2 mm": Condition(
         WeldTruth(heat=HeatTruth(shift=2e-3)), {"distortion": "0.3 mm", "max_error": "2 mm"}
     ),
-    "heat: seam moves 2 mm, with a look behind": Condition(
+    "heat: seam moves 2 mm, with a profiler behind": Condition(
         WeldTruth(heat=HeatTruth(shift=2e-3)), {"distortion": "0.3 mm", "max_error": "2 mm"},
         look=ProfilerTruth(),
     ),
     "heat: 1 mm around the torch": Condition(
         WeldTruth(heat=HeatTruth(local=1e-3)), {"distortion": "0.5 mm", "max_error": "2.5 mm"}
     ),
-    "heat: 1 mm around the torch, with a look behind": Condition(
+    "heat: 1 mm around the torch, with a profiler behind": Condition(
         WeldTruth(heat=HeatTruth(local=1e-3)), {"distortion": "0.5 mm", "max_error": "3.5 mm"},
         look=ProfilerTruth(),
     ),
     "torch 0.2 mm aside": Condition(WeldTruth(tool=ToolTruth(torch=(0.0, 0.2e-3)))),
-    "torch 0.2 mm aside, with a look behind": Condition(
+    "torch 0.2 mm aside, with a profiler behind": Condition(
         WeldTruth(tool=ToolTruth(torch=(0.0, 0.2e-3))), look=ProfilerTruth()
     ),
     "seam wavy 1 mm per 10 mm": Condition(

@@ -14,7 +14,6 @@ from flangeye.plugin.stage import part
 from flangeye.workflow.log.read import JournalEntry, read_notes
 from flangeye.workflow.run.replay import ReplayedStep
 from flangeye_plugins.sensor import piece_of
-from flangeye_plugins.weld.execution import touch_of
 from flangeye_plugins.weld.finger_camera import FingerReader
 from flangeye_plugins.weld.resuming import LoggedWeld
 
@@ -75,7 +74,7 @@ class WeldReplay(LoggedWeld):
         if (feeling is not None) != sight["tag"]:
             self._worst_feeling = np.inf
         if self.newest >= 0:  # those before the start have no number, but the detector saw them
-            self.felt[self.newest] = None if feeling is None else touch_of(feeling)
+            self.felt[self.newest] = None if feeling is None else feeling.touch
 
     def feel(self, logged: Mapping[str, Any]) -> None:
         """Compare the displacement measured again in the newest image with the logged one."""

@@ -11,37 +11,18 @@ import multiprocessing
 import queue
 import signal
 import threading
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple, Self
+from typing import Any, Self, TypeVar
 
 from flangeye.devices import PATIENCE, DeviceError, Profiler, RobotState, TactileSensor, WeldProfile
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import busy, keep_current_folder_out
 from flangeye.types import Floats
-from flangeye_plugins.weld.finger_camera import (
-    CameraJob,
-    FingerReader,
-    LatestState,
-    TagObservation,
-    torch_of,
-)
+from flangeye_plugins.weld.finger_camera import CameraJob, SteppedReader, TagObservation
 
-
-class OpenDevices(NamedTuple):
-    """The devices that are open in the camera process.
-
-    Attributes:
-        latest: Newest state of the arm.
-        reader: Measures the tip's displacement in images.
-        sensor: The camera.
-        look: The profile sensor behind the torch; None without one.
-    """
-
-    latest: LatestState
-    reader: FingerReader
-    sensor: TactileSensor
-    look: Profiler | None
+Item = TypeVar("Item")
 
 
 class CameraProcess:
@@ -62,7 +43,7 @@ class CameraProcess:
         )
         self._state = job.state
         self._sights: queue.SimpleQueue[TagObservation] = queue.SimpleQueue()
-        self._looks: queue.SimpleQueue[WeldProfile] = queue.SimpleQueue()
+        self._profiles: queue.SimpleQueue[WeldProfile] = queue.SimpleQueue()
         self.behind: float | None = None
         self._ending = threading.Event()
         self._error: DeviceError | None = None
@@ -72,17 +53,11 @@ class CameraProcess:
         """Return the measurements since the last call; raise DeviceError if the camera is lost."""
         if self._error is not None:
             raise self._error
-        sights: list[TagObservation] = []
-        while not self._sights.empty():
-            sights.append(self._sights.get())
-        return sights
+        return list(_emptied(self._sights))
 
-    def looks(self) -> list[WeldProfile]:
+    def profiles(self) -> list[WeldProfile]:
         """Return the bead profiles since the last call."""
-        looks: list[WeldProfile] = []
-        while not self._looks.empty():
-            looks.append(self._looks.get())
-        return looks
+        return list(_emptied(self._profiles))
 
     def tell(self, state: RobotState) -> None:
         """Store the arm's newest state, which the thread passes to the camera process."""
@@ -144,7 +119,7 @@ class CameraProcess:
                     # Every 2 ms, a fraction of the time between two images.
                     self._ending.wait(2e-3)
                 elif isinstance(answer, WeldProfile):
-                    self._looks.put(answer)
+                    self._profiles.put(answer)
                 else:
                     self._sights.put(answer)
         except (EOFError, OSError):
@@ -163,52 +138,46 @@ class CameraProcess:
             self._process.join()
 
 
+def _emptied(items: queue.SimpleQueue[Item]) -> Iterator[Item]:
+    while not items.empty():
+        yield items.get()
+
+
 def camera_process(wire: Connection, job: CameraJob) -> None:
     """Open the camera and answer requests; main function of the camera process."""
     for number in (signal.SIGINT, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)  # the program gets it too, and ends this process
-    latest = LatestState(job.state)
     with (
         suppress(EOFError, BrokenPipeError, ConnectionResetError),  # the program is gone
         ExitStack() as opened,
     ):
-        name = "the finger's camera"
         try:
-            reader = FingerReader(job.finger)
-            sensor = opened.enter_context(job.camera(latest))
-            name = "the profile sensor behind the torch"
-            look = job.profiler(latest, sensor)
-            if look is not None:
-                opened.enter_context(look)
+            reader = opened.enter_context(SteppedReader(job))
         except Exception as error:
-            wire.send(_device_error(name, error))
+            wire.send(_device_error("the finger's camera or profiler", error))
             return
-        wire.send(None if look is None else look.behind)
-        seeing = OpenDevices(latest, reader, sensor, look)
+        wire.send(reader.behind)
         while True:
-            wire.send(_answer(wire.recv(), seeing))
+            wire.send(_answer(wire.recv(), reader))
 
 
-def _answer(question: Any, seeing: OpenDevices) -> Any:
+def _answer(question: Any, reader: SteppedReader) -> Any:
     """Return the answer to one request of the main process.
 
     The answer to the arm's state is the next measurement or bead profile, None if there is neither
     yet, or the error. The answer to "torch" is the true path of a simulated torch.
     """
     if question == "torch":
-        return torch_of(seeing.sensor)
-    seeing.latest.tell(question)
-    name = seeing.sensor.name
+        return reader.true_torch()
+    reader.tell(question)
+    device: TactileSensor | Profiler = reader.sensor
     try:
-        frame = seeing.sensor.frame()
-        if frame is not None:
-            return seeing.reader.read(frame)
-        if seeing.look is None:
-            return None
-        name = seeing.look.name
-        return seeing.look.profile()
+        if seen := reader.seen():
+            return seen[0]
+        device = reader.profiler or device
+        return next(iter(reader.profiles()), None)
     except Exception as error:
-        return _device_error(name, error)
+        return _device_error(device.name, error)
 
 
 def _device_error(name: str, error: Exception) -> DeviceError:
@@ -216,3 +185,7 @@ def _device_error(name: str, error: Exception) -> DeviceError:
     if isinstance(error, FlangeyeError):
         return DeviceError(str(error))
     return DeviceError(f"{name}: failed with {type(error).__name__}: {error}")
+
+
+FingerCameraReader = SteppedReader | CameraProcess
+"""Gives all measurements and profiles since the last cycle, oldest first, and never waits."""

@@ -16,9 +16,9 @@ from flangeye.errors import StageError
 from flangeye.models.finger import Finger
 from flangeye.motion.arc import OFF
 from flangeye.motion.executor import Executor
-from flangeye.motion.seam_following import Command, Controller, ToolPose, Touch
+from flangeye.motion.seam_following import Command, Controller, ToolPose
 from flangeye.types import Floats
-from flangeye_plugins.weld.finger_camera import FingerCameraReader
+from flangeye_plugins.weld.camera_process import FingerCameraReader
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.search import UNTOUCHED
 from flangeye_plugins.weld.frame import Tool
@@ -238,10 +238,10 @@ def _turn(
     # Before the controller steers by them: a tip that is out of bounds stops the weld
     cell.bounds.check(pose, controller.tip, felt)
     if cell.steered is not None:
-        for profile in cell.eyes.looks():
+        for profile in cell.eyes.profiles():
             weld_log.looked(profile)
             cell.steered.looked(profile)
-    command = controller.step(pose, [touch_of(feeling) for feeling in felt])
+    command = controller.step(pose, [feeling.touch for feeling in felt])
     twist = cell.tool.twist(command, state.base_T_flange)
     arc = OFF if cell.gas_after is None else float(getattr(controller, "arc", OFF))
     if cell.gas_after is not None:
@@ -249,11 +249,6 @@ def _turn(
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)
     took = (clock.computing, clock.period, clock.answering)
     weld_log.turned(cycle_of(pose, used, command, controller, arc, took))
-
-
-def touch_of(feeling: TipDisplacement) -> Touch:
-    """Return a measurement in the controller's input format."""
-    return Touch(feeling.time_ns * 1e-9, feeling.displacement)
 
 
 def cycle_of(

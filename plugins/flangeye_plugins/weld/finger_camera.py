@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Self
 
 from flangeye.devices import (
     KnowsTorch,
     Profiler,
     RobotState,
     SensorFrame,
-    StateSource,
     TactileSensor,
     WeldProfile,
 )
@@ -96,106 +95,70 @@ class CameraJob(NamedTuple):
         finger: The finger, calibrated.
         state: Current state of the arm.
         seed: Seed of a simulated sensor.
-        look: Opens a profile sensor behind the torch, if there is one.
+        profiler: Opens a profile sensor behind the torch, if there is one.
     """
 
     sensor: BoundPart
     finger: Finger
     state: RobotState
     seed: Seed
-    look: BoundPart | None = None
-
-    def camera(self, robot: StateSource) -> TactileSensor:
-        """Open the camera; a simulated one reads the arm's pose from ``robot``."""
-        sensor: TactileSensor = self.sensor(self.finger, robot, self.seed)
-        return sensor
-
-    def profiler(self, robot: StateSource, camera: TactileSensor) -> Profiler | None:
-        """Open the profile sensor behind the torch; return None if there is none."""
-        return None if self.look is None else self.look(robot, camera, self.seed)
-
-
-class FingerCameraReader(Protocol):
-    """Interface: gives all measurements since the last cycle, oldest first."""
-
-    @property
-    def behind(self) -> float | None:
-        """Distance of the profile behind the torch [m]; None without a profiler."""
-
-    def looks(self) -> list[WeldProfile]:
-        """Return new profiles of the bead; never waits.
-
-        Raises:
-            DeviceError: The profile sensor is lost.
-        """
-
-    def seen(self) -> list[TagObservation]:
-        """Return new measurements; never waits.
-
-        Raises:
-            DeviceError: The camera is lost.
-        """
-
-    def tell(self, state: RobotState) -> None:
-        """Store the arm's newest state, for a simulated sensor; never waits."""
-
-    def true_torch(self) -> tuple[Floats, Floats] | None:
-        """Return the true path of a simulated torch after the weld; else None."""
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
+    profiler: BoundPart | None = None
 
 
 class SteppedReader:
-    """Reads the camera within the control loop: in simulated time computing causes no delay."""
+    """Reads camera and profile sensor where it is called: in simulated time that causes no delay.
+
+    Attributes:
+        sensor: The camera.
+        profiler: The profile sensor behind the torch; None without one.
+    """
 
     def __init__(self, job: CameraJob) -> None:
-        """Open the camera.
+        """Open the camera, then the profile sensor.
 
         Raises:
-            StageError: The camera cannot be opened.
+            StageError: One of them cannot be opened.
         """
         self._latest = LatestState(job.state)
-        self._reader, self._sensor = FingerReader(job.finger), job.camera(self._latest)
+        self._reader = FingerReader(job.finger)
+        self.sensor: TactileSensor = job.sensor(job.finger, self._latest, job.seed)
+        self.profiler: Profiler | None = None
         try:
-            self._look = job.profiler(self._latest, self._sensor)
+            if job.profiler is not None:
+                self.profiler = job.profiler(self._latest, self.sensor, job.seed)
         except BaseException:
-            self._sensor.close()
+            self.sensor.close()
             raise
 
     @property
     def behind(self) -> float | None:
-        """Distance of the profile behind the torch [m]; None without a profiler."""
-        return None if self._look is None else self._look.behind
+        """Distance of the profile behind the torch [m]; None without a profile sensor."""
+        return None if self.profiler is None else self.profiler.behind
 
-    def looks(self) -> list[WeldProfile]:
+    def profiles(self) -> list[WeldProfile]:
         """Return new profiles; raise DeviceError if the sensor is lost."""
-        profile = None if self._look is None else self._look.profile()
+        profile = None if self.profiler is None else self.profiler.profile()
         return [] if profile is None else [profile]
 
     def seen(self) -> list[TagObservation]:
         """Return new measurements; raise DeviceError if the camera is lost."""
-        frame = self._sensor.frame()
+        frame = self.sensor.frame()
         return [] if frame is None else [self._reader.read(frame)]
 
     def tell(self, state: RobotState) -> None:
-        """Store the arm's newest state."""
+        """Store the arm's newest state, for a simulated sensor."""
         self._latest.tell(state)
 
     def true_torch(self) -> tuple[Floats, Floats] | None:
-        """Return the true path of a simulated torch; None for a real one."""
-        return torch_of(self._sensor)
+        """Return a simulated torch's true path: times [s] and positions; None for a real one."""
+        return self.sensor.true_torch() if isinstance(self.sensor, KnowsTorch) else None
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._look is not None:
-            self._look.close()
-        self._sensor.close()
-
-
-def torch_of(sensor: TactileSensor) -> tuple[Floats, Floats] | None:
-    """Return the true path of a simulated sensor's torch: times [s] and positions; else None."""
-    return sensor.true_torch() if isinstance(sensor, KnowsTorch) else None
+        try:
+            if self.profiler is not None:
+                self.profiler.close()
+        finally:
+            self.sensor.close()

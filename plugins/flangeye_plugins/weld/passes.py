@@ -27,7 +27,7 @@ from flangeye_plugins.weld.following.response import Response
 from flangeye_plugins.weld.following.steering import ArcSequence, Weave, WeaveOffset
 from flangeye_plugins.weld.following.task import ResumePoint
 from flangeye_plugins.weld.following.tip import within
-from flangeye_plugins.weld.path import PATH_SPACING, Path, Place
+from flangeye_plugins.weld.path import PATH_SPACING, Path
 from flangeye_plugins.weld.settings import PassParams
 
 GAIN = 2.0
@@ -77,10 +77,7 @@ class MultiPassController:
         aim: Present target of the torch, to the left of the seam [m].
     """
 
-    def __init__(
-        self,
-        root: Follower,
-    ) -> None:
+    def __init__(self, root: Follower) -> None:
         """Start with the root pass, or with the pass in which a resumed weld stopped."""
         task, before = root.task, root.task.before
         plan, prior, settings = task.plan, task.prior, task.settings
@@ -190,7 +187,7 @@ class MultiPassController:
         # Displacement of the end point that brings the torch to the start, with the tool along the
         # path
         aside = start.point + self._prior.distance * start.tangent - pose.position[:2]
-        turn = _nearest(_heading(start) - pose.angle)
+        turn = math.remainder(start.heading - pose.angle, math.tau)
         # A place is reached when the tool is within 0.1 mm and 0.2 deg of it.
         there = float(np.hypot(*aside)) < 0.1e-3 and abs(turn) < math.radians(0.2)
         goal = start.height if there else self._over
@@ -230,7 +227,8 @@ class MultiPassController:
         torch_speed = settings.speed * place.tangent + across * place.normal
         # Rotate with the path's curvature plus a correction of the heading; then, by (12), the end
         # point moves at V_r = V_t + L w n_d
-        turning = GAIN * _nearest(_heading(place) - pose.angle) + settings.speed * self._bend()
+        askew = math.remainder(place.heading - pose.angle, math.tau)
+        turning = GAIN * askew + settings.speed * self._bend()
         turn = within(turning, settings.turn_rate)
         planar = torch_speed + distance * turn * np.array([-ahead[1], ahead[0]])
         up = settings.height_gain * (place.height - float(pose.position[2]))
@@ -245,11 +243,8 @@ class MultiPassController:
 
     def _bend(self) -> float:
         """Return the path's curvature at the torch [1/m], to the left positive."""
-        before, after = (
-            self._path.at(self.torch - PATH_SPACING),
-            self._path.at(self.torch + PATH_SPACING),
-        )
-        return _nearest(_heading(after) - _heading(before)) / (2 * PATH_SPACING)
+        before, after = (self._path.at(self.torch + s) for s in (-PATH_SPACING, PATH_SPACING))
+        return math.remainder(after.heading - before.heading, math.tau) / (2 * PATH_SPACING)
 
     def _estimate(self, error: float) -> None:
         """Update the torch's error bound, given its control error [m]; stop if it is too large."""
@@ -273,15 +268,6 @@ def follower_of(controller: Controller) -> Follower | None:
     if isinstance(controller, MultiPassController):
         return controller.root
     return controller if isinstance(controller, Follower) else None
-
-
-def _heading(place: Place) -> float:
-    return math.atan2(float(place.tangent[1]), float(place.tangent[0]))
-
-
-def _nearest(angle: float) -> float:
-    """Return an angle wrapped to +-pi [rad]."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def _towards(way: Floats, speed: float) -> Floats:

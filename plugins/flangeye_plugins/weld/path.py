@@ -32,6 +32,11 @@ class Place(NamedTuple):
     normal: Floats
     height: float
 
+    @property
+    def heading(self) -> float:
+        """Angle of the tangent from the plane's x [rad]."""
+        return math.atan2(float(self.tangent[1]), float(self.tangent[0]))
+
 
 class Path:
     """A curve with arc length zero at the seam's start, continued straight beyond both ends.

@@ -18,7 +18,7 @@ from flangeye.motion.route import LARGEST_TURN, TABLE, NoRoute, Route, Router
 from flangeye.types import Floats, Transform
 from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool
-from flangeye_plugins.weld.path import Path, Place
+from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 
 ROOM = np.radians(2.0)
@@ -247,7 +247,7 @@ def _stations(task: Task) -> list[Station]:
     aside = start.point + task.aside * start.normal
     above = np.array([*aside, start.height + params.clearance])
     count = 1 + int(np.ceil(abs(task.start.angle) / (JUMP / 2)))
-    angles = _angle(start) + np.linspace(task.start.angle, 0.0, count)
+    angles = start.heading + np.linspace(task.start.angle, 0.0, count)
     # The way from joint to joint ends 50 mm higher.
     tip = task.start.tip
     poses = [tool.base_T_flange(above + [0.0, 0.0, 0.05], float(angles[0]), tip)]
@@ -257,14 +257,10 @@ def _stations(task: Task) -> list[Station]:
     for s in np.arange(0.0, plan.length + params.overlapping(plan) + task.finger.torch, 10e-3):
         place = plan.at(float(s))
         at = np.array([*place.point, place.height])
-        pose = tool.base_T_flange(at, _angle(place), float(s))
+        pose = tool.base_T_flange(at, place.heading, float(s))
         name = f"{s * 1e3:.0f} mm along the seam (the tip goes on beyond its end)"
         stations.append(Station(name, pose))
     return stations
-
-
-def _angle(place: Place) -> float:
-    return float(np.arctan2(place.tangent[1], place.tangent[0]))
 
 
 def _nearest(before: Floats, postures: Floats) -> Floats:

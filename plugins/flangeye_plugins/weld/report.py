@@ -78,7 +78,7 @@ def _advice(controller: Controller) -> tuple[Note, ...]:
         return ()
     return (
         f"{fixed:.0%} of the torch's variance comes from the files' tolerances: "
-        "only a profile behind the torch ('look') can reduce it",
+        "only a profile sensor behind the torch ('profiler') can reduce it",
     )
 
 

@@ -6,6 +6,7 @@ displacements. So nothing has to be saved when a weld stops, even if the process
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path as FilePath
@@ -27,7 +28,6 @@ from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTas
 from flangeye_plugins.weld.passes import MultiPassController, follower_of
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
-from flangeye_plugins.weld.weld_log import LoggedProfiles
 
 RUN_IN = 2 * SETTLING
 """Run-in before the arc, in which the torch recovers from its displacement by the sweep [m]."""
@@ -140,7 +140,7 @@ class LoggedWeld:
         self.controller = controller_from(start)
         self.felt: dict[int, Touch | None] = {}
         self.newest, self.cycles = -1, 0
-        self._looks = LoggedProfiles()
+        self._profiles: dict[int, list[WeldProfile]] = {}
 
     def take(self, note: JournalEntry) -> None:
         """Process the next log entry."""
@@ -148,8 +148,9 @@ class LoggedWeld:
             self.see(note.value)
         elif note.name == "feeling":
             self.feel(note.value)
-        elif note.name == "look":
-            self._looks.take(note.value)
+        elif note.name == "profile":
+            told = dict(note.value)
+            self._profiles.setdefault(told.pop("cycle"), []).append(WeldProfile(**told))
         elif note.name == "cycles":
             self._decide(note.value)
 
@@ -167,7 +168,7 @@ class LoggedWeld:
     def _decide(self, cycles: Mapping[str, list[Any]]) -> None:
         for i, time in enumerate(cycles["time"]):
             pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
-            take_profiles(self.controller, self._looks.of(self.cycles))
+            take_profiles(self.controller, self._profiles.pop(self.cycles, []))
             self.cycles += 1
             felt = [self.felt[number] for number in cycles["touches"][i]]
             command = self.controller.step(pose, [touch for touch in felt if touch is not None])
@@ -209,9 +210,8 @@ def _standing(plan: Path, distance: float, arc_from: float, tip: float) -> WeldS
     """Return the start with the tip and the torch on the plan, for an arc from ``arc_from`` [m]."""
     place = plan.at(tip)
     torch = plan.at(_away(plan, tip, -distance)).point
-    heading = np.arctan2(*(place.point - torch)[::-1]) - np.arctan2(*place.tangent[::-1])
-    angle = float((heading + np.pi) % (2 * np.pi) - np.pi)
-    return WeldStart(tip, arc_from, angle)
+    x, y = (place.point - torch).tolist()
+    return WeldStart(tip, arc_from, math.remainder(math.atan2(y, x) - place.heading, math.tau))
 
 
 def _away(plan: Path, s: float, distance: float) -> float:

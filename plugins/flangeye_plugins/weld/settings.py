@@ -166,7 +166,7 @@ class WeldTactileParams(Following):
     """One of data/fingers, or a .yaml file of one's own."""
     sensor: Annotated[BoundPart, Choose("sensor")]
     """Source of the finger's images, for example {opencv: {device: 0}}."""
-    look: Annotated[BoundPart, Choose("profiler")] | None = None
+    profiler: Annotated[BoundPart, Choose("profiler")] | None = None
     """A profile sensor that sees the bead behind the torch, for example {tcp: {host: 192.168.1.20,
     port: 9000, behind: 30 mm}}. The thermal distortion and torch offset that it measures are
     compensated."""
@@ -194,10 +194,11 @@ class WeldTactileParams(Following):
         Arc and profile sensor need the error bound, which only mode tactile has. The profile sensor
         measures the bead of a single pass without weave.
         """
-        for name in ("arc", "look"):
+        for name in ("arc", "profiler"):
             if getattr(self, name) is not None and self.mode != "tactile":
                 raise ValueError(f"'{name}' goes with mode: tactile only: leave out one of them")
         for name in ("passes", "weave_width"):
-            if self.look is not None and getattr(self, name):
-                raise ValueError(f"'look' is for one pass that does not weave: leave out '{name}'")
+            if self.profiler is not None and getattr(self, name):
+                told = f"'profiler' is for one pass that does not weave: leave out '{name}'"
+                raise ValueError(told)
         return self

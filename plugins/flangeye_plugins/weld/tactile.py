@@ -20,10 +20,10 @@ from flangeye.plugin.stage import stage
 from flangeye.types import Note, Seam, Seed, StageLog, VerifiedHandEye, Warn, WeldReport
 from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_plugins.weld import checks
-from flangeye_plugins.weld.camera_process import CameraProcess
+from flangeye_plugins.weld.camera_process import CameraProcess, FingerCameraReader
 from flangeye_plugins.weld.corners import leg_of
 from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, low_latency
-from flangeye_plugins.weld.finger_camera import CameraJob, FingerCameraReader, SteppedReader
+from flangeye_plugins.weld.finger_camera import CameraJob, SteppedReader
 from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior, body_of, model_prior_of
@@ -71,9 +71,9 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
         robot: Robot = opened.enter_context(servo(driver, model, allowed))
-        job = CameraJob(params.sensor, planned.finger, robot.state(), seed, params.look)
-        reader: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
-        eyes = opened.enter_context(reader)
+        job = CameraJob(params.sensor, planned.finger, robot.state(), seed, params.profiler)
+        eyes: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
+        opened.enter_context(eyes)
         prior = replace(planned.prior, behind=eyes.behind)
         controller = controller_of(plan, prior, params, params.mode, planned.kept, planned.start)
         weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated))
@@ -81,7 +81,7 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         cell = WeldCell(
             Executor(robot, model, allowed, eyes.tell), eyes, planned.tool,
             Bounds(planned.finger, plan),
-            None if params.look is None else follower_of(controller), planned.gas_after,
+            None if params.profiler is None else follower_of(controller), planned.gas_after,
         )  # fmt: skip
         approach(cell, passage, weld_log, params.mode)
         if not driver.simulated:

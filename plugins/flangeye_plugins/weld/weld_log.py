@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple, Self
 
@@ -120,7 +120,7 @@ class WeldLog:
 
     def looked(self, profile: WeldProfile) -> None:
         """Log a bead profile with the number of the present cycle, which uses it."""
-        self.note("look", {"cycle": len(self.cycles), **asdict(profile)})
+        self.note("profile", {"cycle": len(self.cycles), **asdict(profile)})
 
     def turned(self, cycle: Cycle) -> None:
         """Record one control cycle."""
@@ -140,22 +140,6 @@ class WeldLog:
 
     def _put(self, name: str, value: Any) -> None:
         self._log(name, columns(value) if name == "cycles" else value)
-
-
-class LoggedProfiles:
-    """The logged bead profiles by cycle, for stepping through a logged weld."""
-
-    def __init__(self) -> None:
-        self._by_cycle: dict[int, list[WeldProfile]] = {}
-
-    def take(self, look: Mapping[str, Any]) -> None:
-        """Add one logged profile."""
-        told = dict(look)
-        self._by_cycle.setdefault(told.pop("cycle"), []).append(WeldProfile(**told))
-
-    def of(self, cycle: int) -> list[WeldProfile]:
-        """Return the profiles of the cycle with this number, once."""
-        return self._by_cycle.pop(cycle, [])
 
 
 def columns(cycles: Sequence[Cycle]) -> dict[str, list[Any]]:

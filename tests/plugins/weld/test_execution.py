@@ -12,6 +12,7 @@ from flangeye.devices import DeviceError, WeldProfile
 from flangeye.motion.seam_following import Command, Controller, ToolPose
 from flangeye_plugins.weld.execution import WeldClock, follow, low_latency
 from flangeye_plugins.weld.tactile import _longest
+from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import WeldLog
 
 
@@ -86,8 +87,8 @@ class Desk:
         return SimpleNamespace(time_ns=(5 * 10**9 + self.cycles * 10**8), base_T_flange="here")
 
     def seen(self) -> list[Any]:
-        feeling = SimpleNamespace(
-            time_ns=self.cycles * 10**9, displacement=np.full(3, float(self.cycles))
+        feeling = TipDisplacement(
+            self.cycles * 10**9, np.full(3, float(self.cycles)), np.zeros(3), np.eye(3), 1.0
         )
         felt = feeling if self.cycles % 2 else None
         return [
@@ -173,7 +174,7 @@ def test_what_is_seen_behind_the_torch_is_told_before_the_cycle_s_decision() -> 
     desk, controller = Desk(), Ending(2)
     told = list[Any]()
     cell: Any = desk
-    cell.looks = lambda: [WeldProfile(1e-4, 5e-5, 9)]
+    cell.profiles = lambda: [WeldProfile(1e-4, 5e-5, 9)]
     cell.steered = SimpleNamespace(looked=lambda profile: told.append(len(controller.touches)))
     followed(cell, controller)
     assert told == [0, 1]

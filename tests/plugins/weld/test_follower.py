@@ -39,13 +39,13 @@ def make(
     found: Any = Follower(task)
     found.phase = phase
     if phase not in ("seeking", "probing"):
-        found.welding.begin(0.0)
+        found.welding.swept = 0.0
     return found
 
 
 HOLDS = {
     "tip": "progress", "torch": "progress", "coming": "progress", "arc_from": "welding",
-    "bound": "welding", "seen": "sensing", "heard": "sensing", "_lost": "pressing",
+    "bound": "welding", "seen": "sensing", "heard": "sensing", "lost": "pressing",
     "most": "pressing", "wanted": "pressing",
 }  # fmt: skip
 """What of the follower holds a part of its state."""
@@ -83,7 +83,7 @@ def test_all_that_the_torch_s_place_is_uncertain_by_adds_up() -> None:
     asked = found.task.settings
     found.seam.refined = SimpleNamespace(variance=lambda s: 9e-10, angle=lambda s, a: 0.1)
     found.sensing.learned = SweepFit(gain_sigma=0.03, width=0.02e-3, unexplained=0.03e-3)
-    put(found, most=asked.deflection).welding.begin(5.0)
+    put(found, most=asked.deflection).welding.swept = 5.0
     play = (0.02e-3) ** 2 * (1 / 11 + 10 / 33 - 1 / 121)  # of 0.02 in 0.22 mm it stays pressed
     for minutes in (0.0, 2.0):  # the gain that the sweep found ages
         gain = (0.03 + asked.gain_drift * minutes) * asked.deflection
@@ -297,7 +297,7 @@ def test_a_displacement_is_freed_of_rest_play_and_gain(side: str) -> None:
 def test_a_measurement_meets_the_pose_of_its_image_and_is_taken_once() -> None:
     found = make("bridging")
     for i in range(301):
-        found.sensing._track.add(pose(1e-3 * i, time=i * 0.01, angle=0.1 * i))
+        found.sensing.track.add(pose(1e-3 * i, time=i * 0.01, angle=0.1 * i))
     found.sensing.learned, found.sensing.latency = SweepFit(stamp=0.05), 0.1
     found.sensing._level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     at, touch = found.sensing.take(Touch(2.905, np.array([1e-3, 2e-3, 3e-3])), 3.0)
@@ -343,8 +343,8 @@ def swept(**given: Any) -> Any:
     found = make("probing", **given)
     found.sensing.probing = SimpleNamespace(over=True, learned=lambda: SweepFit(swept=2.4e-3))
     down = np.array([0.0, -PRESS, 0.0])
-    found.sensing._swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
-    found.sensing._track.add(pose(0.005, PRESS, -1.5e-3, time=0.1))
+    found.sensing.swept = [(pose(0.005, PRESS), Touch(0.1, down))] * 3
+    found.sensing.track.add(pose(0.005, PRESS, -1.5e-3, time=0.1))
     assert judged(found, now=0.1, seen=0.1, heard=0.1) == "following"
     assert found.pressing.most == pytest.approx(0.8e-3)
     found.seam.contact.deflection, found.seam.contact.compression = PRESS, 1.5e-3
@@ -413,7 +413,7 @@ def test_what_is_felt_while_the_wall_is_in_doubt_waits_until_one_holds(
         s, time = 5e-3 + 1e-4 * i, 0.02 * i
         shown = 0.35e-3 if s > 8e-3 and not (again and s > 12e-3) else PRESS
         at = pose(s, shown, -1.5e-3, time=time)
-        found.sensing.watch(at)
+        found.sensing.track.add(at)
         put(found, now=time)._feel(Touch(time, np.array([0.0, -shown, 1.5e-3])))
         put(found, tip=s)._judge(at, at)
     found.seam.refined.renew(-DISTANCE, 10_000)
@@ -458,8 +458,8 @@ def test_an_arm_that_would_go_on_blindly_is_stopped() -> None:
         ("following", {"seen": -0.99}, ""),  # no arc burns: the arm stands and waits
         ("following", {"seen": -1.01}, "no tag was seen for 2000 ms"),
         ("ending", {"seen": 0.0}, ""),
-        ("bridging", {"seen": 1.0, "_lost": 0.02, "tip": 0.0599}, ""),
-        ("bridging", {"seen": 1.0, "_lost": 0.02, "tip": 0.0601},
+        ("bridging", {"seen": 1.0, "lost": 0.02, "tip": 0.0599}, ""),
+        ("bridging", {"seen": 1.0, "lost": 0.02, "tip": 0.0601},
          "no contact for 40 mm of the seam"),
     ):  # fmt: skip
         assert refused(make(phase), **state) == told
@@ -512,7 +512,7 @@ def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it(
         found.sensing.probing = SimpleNamespace(over=True, learned=lambda: learned)
         found.sensing.search.sigma = np.array([0, scatter, 0])
         down = np.array([0.0, -2e-3, 0.0])
-        found.sensing._swept = [(pose(0.05, 2e-3), Touch(3.9, down))] * 3
+        found.sensing.swept = [(pose(0.05, 2e-3), Touch(3.9, down))] * 3
         assert judged(found, now=4.0, seen=3.9) == "following"
         assert found.sensing.learned.noise == found.seam.refined.noise == noise
         assert (found.arm.dead_time, found.arm.lag) == (0.06, 0.1)
@@ -521,7 +521,7 @@ def test_a_sweep_that_says_why_not_ends_the_weld_and_one_that_learned_begins_it(
 
 def test_an_arm_stands_where_its_camera_has_been_silent_for_too_long() -> None:
     for silence, still in ((0.149, False), (0.151, True)):
-        found = put(make("bridging"), now=1.0, seen=1.0, heard=1.0, tip=0.05, _lost=0.05)
+        found = put(make("bridging"), now=1.0, seen=1.0, heard=1.0, tip=0.05, lost=0.05)
         put(found, torch=0.01, coming=0.01).sensing.felt = SeamReading(0.0, 0.0)
         command = found.step(pose(0.05, 1e-3, time=1.0 + silence), [])
         assert (command is STILL) == still

@@ -126,7 +126,7 @@ def closing(look: Any = None) -> CameraJob:
 def test_in_the_loop_the_camera_sees_what_the_arm_was_told_last_and_is_closed() -> None:
     Closing.closed.clear()
     with SteppedReader(closing()) as reader:
-        assert reader.behind is None and reader.looks() == [] and reader.seen() == []
+        assert reader.behind is None and reader.profiles() == [] and reader.seen() == []
         reader.tell(state(5))
         assert [sight.time_ns for sight in reader.seen()] == [5]
         assert reader.seen() == [] and reader.true_torch() is None
@@ -136,9 +136,9 @@ def test_in_the_loop_the_camera_sees_what_the_arm_was_told_last_and_is_closed() 
 def test_in_the_loop_a_look_behind_the_torch_is_taken_too_and_closed_first() -> None:
     Closing.closed.clear()
     with SteppedReader(closing(ClosingLook)) as reader:
-        assert reader.behind == 0.02 and reader.looks() == []
+        assert reader.behind == 0.02 and reader.profiles() == []
         reader.tell(state(5))
-        assert [look.time_ns for look in reader.looks()] == [5]
+        assert [look.time_ns for look in reader.profiles()] == [5]
     assert Closing.closed == ["look", "camera"]
     Closing.closed.clear()
     with pytest.raises(DeviceError, match="cannot be reached"):

@@ -36,7 +36,7 @@ SHORT = 0.09
 @pytest.fixture(scope="module")
 def weld() -> Any:
     return run(
-        planned("v-straight", end=0.06), seed=3, sensor={"world": ASIDE}, look=LOOK, **SETTINGS
+        planned("v-straight", end=0.06), seed=3, sensor={"world": ASIDE}, profiler=LOOK, **SETTINGS
     )
 
 
@@ -50,7 +50,7 @@ def logged(journal: Any, path: Path) -> Path:
 
 def test_a_weld_is_led_by_what_is_seen_behind_its_torch(weld: Any) -> None:
     _, journal = weld
-    looks = [value for name, value in journal if name == "look"]
+    looks = [value for name, value in journal if name == "profile"]
     seen = np.array([look["offset"] for look in looks])
     assert len(looks) > 30
     assert np.median(seen[:10]) == pytest.approx(0.3e-3, abs=0.05e-3)
@@ -67,7 +67,7 @@ def test_every_decision_is_repeated_from_the_log(weld: Any, tmp_path: Path) -> N
 
 
 def test_without_its_looks_a_weld_is_decided_otherwise(weld: Any, tmp_path: Path) -> None:
-    blind = [(name, value) for name, value in weld[1] if name != "look"]
+    blind = [(name, value) for name, value in weld[1] if name != "profile"]
     ((_, redone),) = replay_steps(logged(blind, tmp_path / "run.mcap"), load_registry())
     assert not redone.same
 
@@ -87,13 +87,13 @@ def test_a_weld_that_was_stopped_is_stepped_through_with_its_looks(
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"mode": "vision"}, "'look' goes with mode: tactile only"),
+        ({"mode": "vision"}, "'profiler' goes with mode: tactile only"),
         ({"passes": [{"across": "1 mm"}]}, "leave out 'passes'"),
         ({"weave_width": "2 mm"}, "leave out 'weave_width'"),
     ],
 )
 def test_what_a_look_does_not_go_with_is_refused(given: Any, message: str) -> None:
-    told = {"sensor": {"opencv": {}}, "look": {"simulated": {}}, **given}
+    told = {"sensor": {"opencv": {}}, "profiler": {"simulated": {}}, **given}
     with pytest.raises(ValidationError, match=message):
         WeldTactileParams.model_validate(told, context=Lookup(load_registry()))
 
@@ -152,7 +152,7 @@ def test_the_cameras_process_reads_the_look_too() -> None:
         assert first_sight(camera).time_ns == 5
         looks: list[WeldProfile] = []
         while not (looks and looks[-1].time_ns == 5):
-            looks += camera.looks()
+            looks += camera.profiles()
         assert looks[-1] == WeldProfile(0.1e-3, 0.05e-3, 5)
 
 
@@ -176,7 +176,7 @@ def late(trial: Any, beyond: float) -> Any:
 
 def test_heat_around_the_torch_is_made_up_for_once_it_was_seen() -> None:
     found = try_condition(
-        CONDITIONS["heat: 1 mm around the torch, with a look behind"], 0, SHORT, 16e-3
+        CONDITIONS["heat: 1 mm around the torch, with a profiler behind"], 0, SHORT, 16e-3
     )
     assert found.done
     assert (found.errors <= found.column("bound")[found.beside]).all()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from flangeye.devices import WeldProfile
-from flangeye_plugins.weld.weld_log import Cycle, LoggedProfiles, WeldLog, columns
+from flangeye_plugins.weld.weld_log import Cycle, WeldLog, columns
 
 
 def cycle(i: int) -> Any:
@@ -60,18 +60,12 @@ def test_cycles_are_kept_column_by_column() -> None:
     assert list(table) == list(Cycle._fields) and table["turn"] == [1.0, 2.0]
 
 
-def test_a_look_is_logged_with_the_cycle_that_takes_it_in_and_given_back_to_that_one() -> None:
-    written, looks = list[Any](), [WeldProfile(1e-4 * i, 5e-5, 7 + i) for i in range(3)]
+def test_a_profile_is_logged_with_the_cycle_that_takes_it_in() -> None:
+    written = list[Any]()
     with WeldLog(lambda name, value: written.append((name, value)), False) as log:
-        log.looked(looks[0])
+        log.looked(WeldProfile(1e-4, 5e-5, 7))
         log.turned(cycle(0))
         log.turned(cycle(1))
-        log.looked(looks[1])
-        log.looked(looks[2])
-    told = [value for name, value in written if name == "look"]
-    assert [each["cycle"] for each in told] == [0, 2, 2]
-    again = LoggedProfiles()
-    for each in told:
-        again.take(each)
-    assert [again.of(i) for i in range(4)] == [[looks[0]], [], looks[1:], []]
-    assert again.of(2) == [] and told[0]["cycle"] == 0  # given once; the log stays as it is
+        log.looked(WeldProfile(2e-4, 5e-5, 8))
+    told = [value for name, value in written if name == "profile"]
+    assert [each["cycle"] for each in told] == [0, 2] and told[1]["offset"] == 2e-4

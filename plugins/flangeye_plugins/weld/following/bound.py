@@ -28,7 +28,10 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 
 REMEDIES = {
-    "fixed": ("torch_sigma, arm_sigma and distortion", "calibrate the tool, or 'look' behind it"),
+    "fixed": (
+        "torch_sigma, arm_sigma and distortion",
+        "calibrate the tool, or add a 'profiler' behind it",
+    ),
     "askew": ("along_sigma, as the tool is askew", "measure it: flangeye tactile calibrate --body"),
     "tip": ("tip_sigma, as the tool turns", "measure it: flangeye tactile calibrate --body"),
     "felt": ("the finger's gain and play, and the weave", "weld faster, or lower 'deflection'"),

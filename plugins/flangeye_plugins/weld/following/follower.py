@@ -59,8 +59,9 @@ class Follower:
         """Return the command for this cycle, given the measurements since the last one."""
         elapsed = self._begin_cycle(pose)
         pose = self.sensing.true(pose)
-        self.sensing.watch(pose)
-        self.seam.renew(self.torch)
+        self.sensing.track.add(pose)
+        if not self.seam.backs:
+            self.seam.refined.renew(self.torch)
         for touch in touches:
             self._feel(touch)
         coming = self.arm.ahead(pose)
@@ -152,8 +153,7 @@ class Follower:
     def _begin_cycle(self, pose: ToolPose) -> float:
         """Store the cycle's time; return the time since the last cycle [s]."""
         if self.now is None:
-            self.sensing.begin(pose.time)
-            self.now = pose.time
+            self.now = self.sensing.seen = self.sensing.heard = pose.time
         elapsed, self.now = pose.time - self.now, pose.time
         return elapsed
 
@@ -184,7 +184,7 @@ class Follower:
     def _silence(self) -> float:
         """Time since the last image of the tag [s]; 0 in a phase that needs none."""
         needed = self.task.touch and self.phase != "ending"
-        return self.sensing.silence(self.now or 0.0) if needed else 0.0
+        return (self.now or 0.0) - self.sensing.heard if needed else 0.0
 
     # --- what follows from it ---------------------------------------------------------------------
 
@@ -205,7 +205,7 @@ class Follower:
             pressing.lose(self.tip)
         elif self.phase == "bridging" and self.seam.regained(pressing):
             self.phase, pressing.firm = "following", sensing.seen
-        elif self.phase == "bridging" and pressing.since_turned(self.tip) > STRIDE:
+        elif self.phase == "bridging" and self.tip - pressing.turned > STRIDE:
             pressing.turn_over(self.tip)
         self.seam.leave(self.phase)
         if self.torch >= self.welding.ends and self.phase != "stopped":
@@ -261,10 +261,9 @@ class Follower:
         sensing.learned = found
         self.arm.dead_time, self.arm.lag = found.dead_time, found.lag
         self.pressing.learn(found, seam.stands(found))
-        self.welding.begin(self.now or 0.0)
+        self.welding.swept = self.now or 0.0
         swept = [
-            sensing.locate(sensing.true(pose), touch, self.phase)
-            for pose, touch in sensing.swept_last()
+            sensing.locate(sensing.true(pose), touch, self.phase) for pose, touch in sensing.swept
         ]
         seam.begin(found, float(sensing.search.sigma[2]), swept, self.torch)
         if swept:
@@ -291,7 +290,7 @@ class Follower:
         unseen = pose.time - sensing.seen
         if self.task.touch and self.phase != "ending" and unseen > patience:
             return f"no tag was seen for {patience * 1e3:.0f} ms"
-        if self.phase == "bridging" and (self.pressing.since_lost(self.tip) > settings.longest_gap):
+        if self.phase == "bridging" and self.tip - self.pressing.lost > settings.longest_gap:
             return f"no contact for {settings.longest_gap * 1e3:.0f} mm of the seam"
         # There, at 70 % of the radius, all places of a curve are nearly as near.
         if self.phase in ("following", "bridging") and self._aside(pose) > 0.7:
@@ -381,7 +380,8 @@ class Follower:
             return
         self.progress.back(pose, coming)
         contact = self.seam.contact
-        lost = self.seam.lost_for(self.now or 0.0) > self.task.settings.sure
+        since = self.seam.lost
+        lost = since is not None and (self.now or 0.0) - since > self.task.settings.sure
         # Where the joint is felt farther back than the seam may begin, it goes on there.
         on = contact.at < -self.task.beyond - INSIDE and contact.bears
         if lost or on:

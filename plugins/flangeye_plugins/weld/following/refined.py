@@ -29,6 +29,9 @@ SIZES, CORRELATIONS = (1.0, 3.0, 10.0), (4e-3, 12e-3, 36e-3)
 PRIOR = np.array([5e-3, 5e-3, 0.05])
 """Standard deviations of the plan's error: shift along x and y [m], rotation [rad]."""
 
+Sample = tuple[float, float, float, float]
+"""Arguments of :meth:`RefinedPath.add`: arc length, offset, angle and doubt."""
+
 
 class _Field:
     """State-space form of M Matern-5/2 processes: transitions and stationary covariance."""
@@ -102,7 +105,7 @@ class RefinedPath:
         self._covariance[:, 3:, 3:] = self._field.stationary
         self._excess = np.ones(models)
         self._at, self._next, self._low = 0.0, 0, 0
-        self._sure: deque[tuple[float, float, float, float]] = deque()
+        self._sure: deque[Sample] = deque()
 
     def add(self, s: float, offset: float, angle: float, doubt: float = 0.0) -> None:
         """Add a measurement: the seam is ``offset`` to the left of the plan at ``s`` [m].

@@ -16,7 +16,7 @@ from flangeye.types import Floats
 from flangeye_plugins.weld.following.contact import LOSS_PROBABILITY, Contact, ContactMeasurement
 from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.probing import SOFTER, SWEEP_MARGIN, Probing
-from flangeye_plugins.weld.following.refined import RefinedPath
+from flangeye_plugins.weld.following.refined import RefinedPath, Sample
 from flangeye_plugins.weld.following.search import SweepSearch
 from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.following.tip import DeflectionTarget, SeamProgress
@@ -68,6 +68,8 @@ class Sensing:
         seen: Time of the newest touch [s].
         heard: Time at which that touch arrived [s].
         latency: Running mean of the touches' latency [s].
+        track: The tool's poses, for touches that arrive later.
+        swept: Last touches of the sweep, with which the path begins.
     """
 
     def __init__(self, task: WeldTask, progress: SeamProgress, pressing: DeflectionTarget) -> None:
@@ -79,21 +81,13 @@ class Sensing:
         self.felt: SeamReading | None = None if task.touch else SeamReading(0.0, 0.0)
         self.seen = self.heard = self.latency = 0.0
         self._level = np.array(prior.level_R_tool)
-        self._track = Track()
-        self._swept: list[tuple[ToolPose, Touch]] = []
-
-    def begin(self, now: float) -> None:
-        """Start the clock for images at a time [s]."""
-        self.seen = self.heard = now
+        self.track = Track()
+        self.swept: deque[tuple[ToolPose, Touch]] = deque(maxlen=20)
 
     def true(self, pose: ToolPose) -> ToolPose:
         """Return the pose with the tip's position ahead corrected by the sweep's estimate."""
         ahead = self.learned.ahead * np.array([*pose.direction, 0.0])
         return ToolPose(pose.time, pose.position + ahead, pose.angle)
-
-    def watch(self, pose: ToolPose) -> None:
-        """Store the tool's pose, for touches that arrive later."""
-        self._track.add(pose)
 
     def take(self, touch: Touch, now: float) -> tuple[ToolPose, Touch] | None:
         """Return the tool's pose at the time of a touch, and the touch in level axes (equation 13).
@@ -106,7 +100,7 @@ class Sensing:
         """
         if not self._task.touch or touch.time <= self.seen:
             return None
-        pose = self._track.at(touch.time - self.learned.stamp)
+        pose = self.track.at(touch.time - self.learned.stamp)
         if pose is None:
             return None
         self.seen, self.heard = touch.time, now
@@ -151,15 +145,7 @@ class Sensing:
         self.smooth(found.seam, noise)
         across = -self._pressing.side * found.deflection
         self.probing.feel(touch.time, across, found.seam.height, along)
-        self._swept.append((pose, touch))
-
-    def swept_last(self) -> list[tuple[ToolPose, Touch]]:
-        """Return the last touches of the sweep, with which the path begins."""
-        return self._swept[-20:]
-
-    def silence(self, now: float) -> float:
-        """Return the time since the last image of the tag [s]."""
-        return now - self.heard
+        self.swept.append((pose, touch))
 
     def smooth(self, felt: SeamReading, noise: float) -> None:
         """Add a reading to the running mean ``felt``; the noisier the finger, the longer the mean.
@@ -205,15 +191,6 @@ class Track:
         return ToolPose(time, position, before.angle + share * (after.angle - before.angle))
 
 
-class _Sample(NamedTuple):
-    """Arguments of :meth:`RefinedPath.add`."""
-
-    s: float
-    offset: float
-    angle: float
-    doubt: float
-
-
 class SeamEstimate:
     """The tip's contact, and the seam estimated from it.
 
@@ -236,8 +213,8 @@ class SeamEstimate:
         )  # fmt: skip
         self.refined = self._path()
         self._heights: deque[float] = deque(maxlen=20)
-        self._backed: list[_Sample] | None = None
-        self._sat: list[_Sample] = []
+        self._backed: list[Sample] | None = None
+        self._sat: list[Sample] = []
         self._moved: list[float] = []
         self._around = False
 
@@ -258,11 +235,6 @@ class SeamEstimate:
         """Whether the tip is going back to the seam's start."""
         return self._backed is not None
 
-    def renew(self, torch: float) -> None:
-        """Process queued touches within a cycle's time budget; ``torch`` is its arc length [m]."""
-        if not self.backs:
-            self.refined.renew(torch)
-
     def stands(self, found: SweepFit) -> float:
         """Return the largest deflection at which the tip stayed seated in the sweep [m]."""
         return min(found.swept, SWEEP_MARGIN * self._task.settings.deflection)
@@ -282,16 +254,12 @@ class SeamEstimate:
             self.contact.steady = self.stands(found) / self._task.settings.preload
         self.contact.noise = found.noise, height_noise
         self.contact.play = abs(found.width) * (1.0 + found.kept) / (1.0 + found.gain)
-        self._backed = [_Sample(each.s, each.seam.offset, each.angle, 0.0) for each in swept]
+        self._backed = [(each.s, each.seam.offset, each.angle, 0.0) for each in swept]
         self.arrive(found, torch)
 
     def back(self) -> None:
         """Start going back to the seam's start; touches on the way are collected."""
         self._backed = []
-
-    def lost_for(self, now: float) -> float:
-        """Return the time since the tip lost contact [s]; 0 in contact."""
-        return 0.0 if self.lost is None else now - self.lost
 
     def arrive(self, found: SweepFit, torch: float, lost: bool = False) -> None:
         """Rebuild the path from the touches of the sweep and of the way back to the start.
@@ -368,7 +336,7 @@ class SeamEstimate:
         if task.feels_ends and task.prior.two_walls:
             end = task.plan.length + task.beyond
         for felt, doubt in self.contact.settled(until):
-            sample = _Sample(felt.s, felt.offset, felt.angle, doubt)
+            sample = felt.s, felt.offset, felt.angle, doubt
             self._heights.append(felt.height)
             if self._backed is not None:
                 self._backed.append(sample)

@@ -62,6 +62,8 @@ class DeflectionTarget:
         wanted: Present set point [m].
         side: Side of the pressed wall: 1 left, -1 right.
         firm: Time of the newest touch by which a wall surely held the tip [s].
+        lost: Arc length at which the tip lost its wall [m].
+        turned: Arc length at which it last changed sides [m].
     """
 
     def __init__(self, task: WeldTask) -> None:
@@ -69,7 +71,7 @@ class DeflectionTarget:
         # Until the sweep shows at which deflection the tip stays seated
         self.most = settings.deflection / (SOFTER if task.prior.two_walls else 1.0)
         self.wanted, self.side = 0.0, settings.sign
-        self._lost = self._turned = 0.0
+        self.lost = self.turned = 0.0
         self.firm = -math.inf
 
     def learn(self, found: SweepFit, swept: float) -> None:
@@ -136,22 +138,14 @@ class DeflectionTarget:
 
     def lose(self, tip: float) -> None:
         """Start to seek a lost wall, on the other side first; ``tip`` is an arc length [m]."""
-        self._lost = tip
+        self.lost = tip
         self.turn_over(tip)
 
     def turn_over(self, tip: float) -> None:
         """Press towards the other side, in a joint with two walls."""
-        self._turned = tip
+        self.turned = tip
         if self._task.prior.two_walls:
             self.side, self.wanted = -self.side, -self.wanted
-
-    def since_lost(self, tip: float) -> float:
-        """Return the tip's travel since it lost contact with its wall [m]."""
-        return tip - self._lost
-
-    def since_turned(self, tip: float) -> float:
-        """Return the tip's travel since it last changed sides [m]."""
-        return tip - self._turned
 
 
 def within(value: float, most: float) -> float:

@@ -30,6 +30,7 @@ class Welding:
         arc_from: Arc length at which the arc was struck [m]; None before.
         bias: Estimate of the torch's bias from the profile sensor behind it.
         striking: Sequence of gas and arc.
+        swept: Time of the sweep, from which the drift of the finger's gain counts [s].
     """
 
     def __init__(
@@ -52,13 +53,9 @@ class Welding:
         self._sigmas = along(task.plan, prior, settings)
         self.arc_from: float | None = None
         self._trail = Trail()
-        self._swept: float | None = None
+        self.swept: float | None = None
         self._foreseen = -math.inf, 0.0, 0.0
         self._usual = 0.0
-
-    def begin(self, now: float) -> None:
-        """Set the time of the sweep [s], from which the drift of the finger's gain counts."""
-        self._swept = now
 
     # --- how well the torch is known --------------------------------------------------------------
 
@@ -78,7 +75,7 @@ class Welding:
         self.sigma = math.sqrt(variance)
         self.band = error + BAND * self.sigma
         self.bound = error + self._sigmas * self.sigma
-        return "" if self._swept is None else self._light(pose.time, raw, variance)
+        return "" if self.swept is None else self._light(pose.time, raw, variance)
 
     def variance(self, slant: float, pose: ToolPose) -> float:
         """Return the variance of the torch's position across the seam [m^2].
@@ -89,7 +86,7 @@ class Welding:
         """
         prior, settings, refined = self._task.prior, self._task.settings, self._seam.refined
         torch = self._progress.torch
-        minutes = 0.0 if self._swept is None else (pose.time - self._swept) / 60.0
+        minutes = 0.0 if self.swept is None else (pose.time - self.swept) / 60.0
         turned = 2.0 * math.sin((pose.angle - refined.angle(torch, pose.angle)) / 2.0)
         stance = Stance(slant, turned, minutes)
         parts = varying(prior, settings, self._sensing.learned, self._pressing.most, stance)

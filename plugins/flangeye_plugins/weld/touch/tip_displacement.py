@@ -8,7 +8,8 @@ import numpy as np
 
 from flangeye.errors import StageError
 from flangeye.models.finger import Finger
-from flangeye.types import Array, Floats
+from flangeye.motion.seam_following import Touch
+from flangeye.types import Array
 from flangeye.types.geometry import nearest_rotation, rotation_exp, rotation_log
 from flangeye_plugins.weld.touch.tag_observation import TagReading
 
@@ -31,15 +32,10 @@ class TipDisplacement:
     covariance: Array
     confidence: float
 
-    def turned_by(self, base_R_tool: Floats) -> TipDisplacement:
-        """Return the deformation in the base's axes."""
-        return TipDisplacement(
-            self.time_ns,
-            base_R_tool @ self.displacement,
-            base_R_tool @ self.rotation,
-            base_R_tool @ self.covariance @ base_R_tool.T,
-            self.confidence,
-        )
+    @property
+    def touch(self) -> Touch:
+        """The displacement in the controller's input format."""
+        return Touch(self.time_ns * 1e-9, self.displacement)
 
 
 class Interpreter:
