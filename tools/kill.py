@@ -161,9 +161,10 @@ class Trial:
     def kill(self, count: int) -> None:
         """Measure the duration of one complete run, then kill ``count`` runs."""
         began = time.monotonic()
-        whole = self._start(self._kind.command, self._folder / "whole")
-        if whole.wait() not in (0, 1):
-            raise SystemExit(f"{self._kind.command} ends with {whole.returncode}")
+        whole = self._start(self._kind.command, self._folder / "whole", stderr=subprocess.PIPE)
+        _, told = whole.communicate()
+        if whole.returncode not in (0, 1):
+            raise SystemExit(f"{' '.join(self._kind.command)}: {told.decode().strip()}")
         self._duration = time.monotonic() - began
         for number in range(count):
             share = self._chance.random()
@@ -209,6 +210,8 @@ class Trial:
 
     def _lost(self, path: Path, finished: set[str]) -> Iterator[str]:
         """Yield what of a log cannot be read though it was finished before."""
+        if not (finished or path.exists()):
+            return  # the page's server was killed: its run was told to stop, and had no capture yet
         self._logs += 1
         try:
             log = read_run(path)
