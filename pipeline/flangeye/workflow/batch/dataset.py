@@ -182,10 +182,12 @@ class Dataset:
 
         try:
             table = pq.read_table(io.BytesIO(self._place.read(name) or b""))
-            table.validate(full=True)  # text that is no UTF-8 fails only when it is looked at
+            if table.schema == self._schema:  # names that are no UTF-8 end here
+                table.validate(full=True)  # text that is none fails only when it is looked at
+                return table
         except (pa.ArrowException, OSError):
-            return self._schema.empty_table()
-        return table if table.schema == self._schema else self._schema.empty_table()
+            pass
+        return self._schema.empty_table()
 
     def _write(self, name: str, table: pa.Table) -> None:
         import pyarrow.parquet as pq
