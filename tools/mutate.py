@@ -37,7 +37,12 @@ from tools.covering import NAMED
 ROOT = Path(__file__).parents[1]
 ROOMS: dict[str, tuple[str, ...]] = {
     "motion": ("pipeline/flangeye/motion", "tests/motion", "tests/plugins/arc"),
-    "estimator": ("pipeline/flangeye/estimation", "tests/estimation"),
+    "estimator": (
+        "pipeline/flangeye/estimation", "tests/estimation",
+        "tests/workflow/doctor/monitor/test_attribution.py",
+        "tests/workflow/doctor/monitor/test_drift.py",
+        "tests/workflow/doctor/monitor/test_pose_error.py",
+    ),
     "fit": ("plugins/flangeye_plugins/fit", "tests/plugins/fit"),
     "segment": ("plugins/flangeye_plugins/segment", "tests/plugins/segment"),
     "verify": ("plugins/flangeye_plugins/verify", "tests/plugins/verify"),

@@ -49,6 +49,10 @@ def test_as_many_are_found_as_the_arm_can_do_and_none_where_the_flange_cannot_be
     assert poses_near(PLACE, 2, site(facing=lambda place: None), rng()) == []
 
 
+def test_a_flange_shows_its_face_unless_said_otherwise() -> None:
+    assert site().shown().tolist() == [0.0, 0.0, 1.0]
+
+
 def test_no_tilt_is_the_facing_itself() -> None:
     assert tilted(PLACE, FACING, 0.0, rng())[:3, :3] == pytest.approx(FACING)
 

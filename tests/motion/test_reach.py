@@ -341,6 +341,9 @@ def test_a_body_is_worked_with_at_the_nearest_depth_at_which_it_can_be_shown() -
     arm = Reach(MODEL, scanner(near=1.1, far=2.3), camera, TORCH)
     assert arm.middle() == pytest.approx([0.6, 0.0, 0.9])
     assert arm.why_refused() == ""  # what was tried on the way is no pose that was asked for
+    camera[2, 3] = 1.2  # and here all of it; 0.6 m is the working distance
+    arm = Reach(MODEL, scanner(near=0.3, far=0.9), camera, TORCH)
+    assert arm.middle() == pytest.approx([0.6, 0.0, 0.6])
 
 
 def test_a_body_out_of_the_field_or_behind_the_arm_is_refused() -> None:

@@ -17,7 +17,7 @@ from hypothesis.extra.numpy import arrays
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.workflow.log.read import RunLog, read_run
+from flangeye.workflow.log.read import RunLog, log_of, read_notes, read_run
 from flangeye.workflow.log.record import Recorder, adapter
 from tests.crafted import rewritten
 
@@ -80,6 +80,30 @@ def test_a_log_knows_its_recipe_its_last_joints_and_whether_its_scans_are_whole(
         assert log.has_recipe and log.has_full_clouds is full
         assert log.last_joints.tolist() == [0.3, 0.4]
         (tmp_path / "r.mcap").unlink()
+
+
+def test_what_steps_noted_comes_back_as_data_and_as_pixels(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (4, 5, 3), np.uint8)
+    recorder = Recorder(tmp_path / "r.mcap", {}, False)
+    recorder.flangeye_noted("7.weld.tactile", "depth", {"mm": 1.5})
+    recorder.flangeye_noted("7.weld.tactile", "seen", t.Image(pixels, np.eye(3)))
+    recorder.flangeye_noted("0.acquire.live", "next", {"id": "4"})
+    recorder.close()
+    depth, seen, after = read_notes(tmp_path / "r.mcap")
+    assert (depth.step, depth.name, depth.value) == ("7.weld.tactile", "depth", {"mm": 1.5})
+    assert (seen.step, seen.name) == ("7.weld.tactile", "seen")
+    np.testing.assert_array_equal(seen.value, pixels)
+    (only,) = read_notes(tmp_path / "r.mcap", {"0.acquire.live"})
+    assert only == after and only.value == {"id": "4"}
+    assert read_run(tmp_path / "r.mcap").noted == {"7.weld.tactile", "0.acquire.live"}
+
+
+def test_a_run_is_named_by_its_folder_or_by_any_file_in_it(tmp_path: Path) -> None:
+    log, report = tmp_path / "run.mcap", tmp_path / "report.html"
+    assert log_of(report) == report  # there is no log beside it
+    log.write_bytes(b"")
+    assert [log_of(path) for path in (tmp_path, log, report)] == [log, log, log]
+    assert log_of(tmp_path / "poses.csv") == tmp_path / "poses.csv"
 
 
 def test_names_that_are_no_utf_8_are_written_out_or_replaced(tmp_path: Path) -> None:
