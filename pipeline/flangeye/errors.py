@@ -1,7 +1,7 @@
 """Exceptions that end a run early, each with its exit code.
 
-A message says where, what is wrong, what is allowed and what to do; the command line prints
-it as it is, without a traceback.
+A message says where, what is wrong, what is allowed and what to do; the command line prints it
+without a traceback.
 """
 
 from collections.abc import Mapping
@@ -9,9 +9,22 @@ from typing import Any
 
 
 class FlangeyeError(Exception):
-    """An error that one line explains to the user; ``exit_code`` is the process's exit code."""
+    """An error that one line explains to the user.
+
+    Attributes:
+        exit_code: The process's exit code.
+        wrong: What is wrong, and how it is known.
+        advice: The one next step; empty where ``wrong`` says all.
+    """
 
     exit_code = 2
+
+    def __init__(self, wrong: str = "", advice: str = "") -> None:
+        super().__init__(wrong)
+        self.wrong, self.advice = wrong, advice
+
+    def __str__(self) -> str:
+        return "; ".join(filter(None, (self.wrong, self.advice)))
 
 
 class RecipeError(FlangeyeError):
@@ -27,7 +40,7 @@ class NothingSeen(StageError):
 
 
 class CalibrationRefused(FlangeyeError):
-    """Valid input gives no reliable calibration; the message says why and what is missing."""
+    """Valid input gives no reliable calibration."""
 
     exit_code = 1
 

@@ -85,7 +85,8 @@ def refine_compensate(
     if error is None:
         raise CalibrationRefused(
             f"refine.compensate: the error on view {views[0].id} could not be measured, so "
-            "equation (19) cannot be applied; leave the step out, or see what verify.icp says"
+            "equation (19) cannot be applied",
+            "leave the step out, or see what verify.icp says",
         )
     after = compensated(before, error, params.rotation)
     pairs = [_moved(pair, before, after) for pair in calibration.pairs]

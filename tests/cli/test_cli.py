@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from flangeye import __version__
 from flangeye.cli import commands
-from flangeye.cli.running import _split_advice
 from flangeye.errors import NothingMoved
 from flangeye.types import Rejection
 from tests import toy
@@ -346,23 +345,6 @@ def test_a_refusal_names_the_motion_that_is_missing(
     code, out, _ = flangeye("run", toy_recipe, *words)
     assert code == 1
     assert "Next step         go to the low end of the work along x" in out
-
-
-@pytest.mark.parametrize(
-    ("message", "advice"),
-    [
-        ("all 3 poses are the same: move the arm", "move the arm"),
-        (
-            "centres lie on a line: rotation is unknown; move the arm across it",
-            "move the arm across it",
-        ),
-        ("a line fits (configuration: {place: unknown} finds it): spread them", "spread them"),
-        ("the arm is lost", ""),
-    ],
-)
-def test_the_advice_of_a_solver_is_the_next_step(message: str, advice: str) -> None:
-    wrong, found = _split_advice(message)
-    assert (found, message.startswith(wrong)) == (advice, True)
 
 
 def test_solvers_are_compared_by_exchanging_a_step(

@@ -30,4 +30,5 @@ def test_a_seam_that_is_not_there_is_no_fault_of_the_calibration(
     last = out[out.index("What is wrong") :]
     assert code == 1 and "seam.joint: no vee joint within" in last
     assert "the calibration before it was accepted" in last and "doctor" not in last
-    assert "--at scan.file" in " ".join(last.split())
+    assert "Next step         name the joint that is there (joint)" in last
+    assert "--at scan.file" in " ".join(last[last.index("then ") :].split())

@@ -115,6 +115,15 @@ def test_a_refusal_has_three_parts() -> None:
     assert [line.split("  ")[0] for line in out.getvalue().splitlines()] == [
         "What is wrong", "How it is known", "Next step", "or",
     ]  # fmt: skip
+    out.truncate(0)
+    print_refusal(Console(file=out), "what", "how", ["do this", "and that"], "then")
+    assert out.getvalue().splitlines()[-1] == "then              and that"
+
+
+def test_the_details_of_a_refusal_have_its_next_step() -> None:
+    out = io.StringIO()
+    print_details(Console(file=out), result(status="refused", refused="why", advice="do this"))
+    assert "refused: why\nnext step: do this\n" in out.getvalue()
 
 
 def test_commands_stay_whole_when_lines_are_wrapped() -> None:

@@ -102,7 +102,7 @@ def test_two_steps_need_an_arm_that_rests() -> None:
         solve("two_steps", made)
     assert str(error.value) == (
         "the second arm stands still at 1 poses at most, and 3 are needed at which only the first "
-        "moves: record such poses, or use solve.robust, which needs none"
+        "moves; record such poses, or use solve.robust, which needs none"
     )
 
 

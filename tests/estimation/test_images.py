@@ -101,7 +101,8 @@ def test_a_print_of_another_size_is_named_by_the_arms_motion(tmp_path: Path) -> 
     assert seen.refused.startswith("the arm's motion shows that the target is 1.0")
     factor = float(seen.refused.split("target is ")[1].split()[0])
     assert factor == pytest.approx(30 / 29.1, abs=2e-3)
-    assert "or the camera's focal length wrong by as much: measure the print" in seen.refused
+    assert seen.refused.endswith("or the camera's focal length wrong by as much")
+    assert seen.advice.startswith("measure the print (size_limit allows more")
 
 
 def test_a_print_that_is_right_is_never_called_wrong(tmp_path: Path) -> None:

@@ -244,7 +244,7 @@ def test_a_size_that_the_motion_does_not_tell_is_refused() -> None:
     made = session(MARKER, np.random.default_rng(18), n=12, poses=poses, noise=Noise().scaled(20))
     told = refusal(made, target_size="unknown")
     assert told.startswith("the target's size is known to ")
-    assert told.endswith("move the arm further between poses, or say target_size: known")
+    assert told.endswith("move the arm further between poses, or write target_size: known")
 
 
 @pytest.mark.parametrize(("tilt", "warned"), [(2e-3, True), (0.3, False)])

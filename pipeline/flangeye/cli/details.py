@@ -34,6 +34,7 @@ def print_details(console: Console, result: Result) -> None:
     count = f"{used} of {len(result.observations)} captures used"
     lines = [result.title, f"{status_of(result)}: {count}"]
     lines += [f"refused: {result.refused}"] if result.refused else []
+    lines += [f"next step: {result.advice}"] if result.advice else []
     for each in result.warnings:
         lines += [f"warning: {each.text}", f"  -> {each.fix}"]
     for name, estimate in result.transforms.items():

@@ -169,7 +169,7 @@ def _exported(
 def _calibrated(
     run: Path, stage: Stage, anyway: bool, camera: str | None
 ) -> tuple[RunLog, CalibratedPose]:
-    """Return a run's log and its calibration as a format takes it."""
+    """Return a run's log, and its calibration as the input of an export format."""
     from flangeye.errors import StageError
     from flangeye.models.configuration import CELL
     from flangeye.workflow.log.read import read_run

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -172,12 +171,15 @@ def _explain_refusal(
     from flangeye.workflow.log.read import read_run
     from flangeye.workflow.run.outlook import motions_to_add
 
-    wrong = str(result.refused)
-    after = _after_verification(recipe)
-    if (step := wrong.split(":")[0]) in after:
-        again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {after[0]}"
-        known = f"{step} measured it; the calibration before it was accepted"
-        print_refusal(Console(), wrong, known, [with_urls(again)])
+    wrong, advice = str(result.refused), result.advice
+    passed = {step: found.passed for step, found in result.verifications.items()}
+    if passed and all(passed.values()):
+        names = [step.stage.name for step in recipe.steps]
+        last = max(i for i, name in enumerate(names) if name.startswith("verify."))
+        again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {names[last + 1]}"
+        steps = [*filter(None, (advice, with_urls(again)))]
+        known = "this step measured it; the calibration before it was accepted"
+        print_refusal(Console(), wrong, known, steps, "then")
         return
     findings, known = _findings(log, registry, recipe)
     errors = with_urls(f"list each pose's error: flangeye show {quote(str(log.parent))} --outlook")
@@ -185,32 +187,10 @@ def _explain_refusal(
         named, tried, steps = combined_fix(findings)
         print_refusal(Console(), named, tried or wrong, [*filter(None, steps[:2])] or [errors])
         return
-    failed = [step for step, found in result.verifications.items() if not found.passed]
-    if failed:
-        known, advice = f"{' and '.join(failed)} failed; {known}", ""
-    else:
-        wrong, advice = _split_advice(wrong)
-    if any(step.endswith("verify.drift") for step in failed):
-        advice = "put the scanner back; or take verify.drift out of the recipe and use the new pose"
+    if failed := [step for step, good in passed.items() if not good]:
+        known = f"{' and '.join(failed)} failed; {known}"
     motions = [] if advice else motions_to_add(read_run(log), registry)
     print_refusal(Console(), wrong, known, [next(filter(None, (advice, *motions, errors)))])
-
-
-def _split_advice(message: str) -> tuple[str, str]:
-    """Return what a solver refused, and its advice: the text after the first ``;``, or ``:``.
-
-    Brackets are skipped, since a line of a recipe in them contains colons.
-    """
-    flat = re.sub(r"\([^)]*\)|\{[^}]*\}", lambda found: "_" * len(found[0]), message)
-    at = max(flat.find("; "), 0) or flat.find(": ")
-    return (message[:at], message[at + 2 :]) if at > 0 else (message, "")
-
-
-def _after_verification(recipe: Recipe) -> list[str]:
-    """Return the names of the steps that use a calibration: those after its last verification."""
-    names = [step.stage.name for step in recipe.steps]
-    verified = [i for i, name in enumerate(names) if name.startswith("verify.")]
-    return names[verified[-1] + 1 :] if verified else []
 
 
 def _findings(log: Path, registry: Registry, recipe: Recipe) -> tuple[Sequence[Finding], str]:

@@ -97,11 +97,13 @@ def _camera_of_several(result: Result) -> str:
     return f" --camera {next(iter(cameras))}" if cameras else ""
 
 
-def print_refusal(console: Console, wrong: str, known: str, next_steps: Collection[str]) -> None:
-    """Print what is wrong, how it is known, and what to do next."""
+def print_refusal(
+    console: Console, wrong: str, known: str, next_steps: Collection[str], joined: str = "or"
+) -> None:
+    """Print what is wrong, how it is known, and what to do next: two steps are joined by a word."""
     write(console, wrapped(console, f"What is wrong     {wrong}", 18), "red")
     write(console, wrapped(console, f"How it is known   {known}", 18))
-    for name, step in zip(("Next step", "or"), next_steps, strict=False):
+    for name, step in zip(("Next step", joined), next_steps, strict=False):
         if step.startswith(("- ", "configuration:")):  # of the recipe, to paste as it stands
             write(console, f"{name:<15}   write in the recipe:\n  {step}")
         else:

@@ -98,7 +98,7 @@ class CertifiedAnswer:
         return first, second
 
     def place(self, step: PathStep, times: Indices) -> Floats:
-        """Return the (M, 4, 4) places of a step whose frame is known."""
+        """Return a known frame's pose (M, 4, 4) at each time, inverted on a path backwards."""
         place = np.asarray(self.frames[step.name].place)
         every = np.broadcast_to(place, (len(times), 4, 4)) if place.ndim == 2 else place[times]
         return invert(every) if step.back else every
@@ -208,7 +208,7 @@ def _seen_from(answer: CertifiedAnswer) -> str | None:
 
 
 def _size(answer: CertifiedAnswer, root: str) -> int:
-    """Return the number of features of the certificate; 0 if the errors are not quadratic."""
+    """Return the size of the certificate's matrix for a root; 0 if the errors are not quadratic."""
     ways = [way for ends in dict.fromkeys(answer.ends) for way in answer.unknown(ends, root)]
     index = {name: i for i, name in enumerate(answer.places)}
     pairs = {(index[way[0].name], index[way[1].name]) for way in ways if len(way) == 2}

@@ -169,8 +169,8 @@ def require_same_units(centres: Floats, tcps: Floats) -> None:
     ratio = _median_distance(centres) / _median_distance(tcps)
     if not 0.5 < ratio < 2.0:
         raise CalibrationRefused(
-            f"the circle centres are {ratio:.4g} times as far apart as the robot's poses: "
-            "both must be in metres, and each scan must belong to its pose"
+            f"the circle centres are {ratio:.4g} times as far apart as the robot's poses",
+            "check that both are in metres, and that each scan belongs to its robot pose",
         )
 
 
@@ -186,7 +186,8 @@ def require_right_handed(centres: Floats, tcps: Floats) -> None:
     if straight > 1e-3 and mirrored < 0.1 * straight:
         raise CalibrationRefused(
             f"the centres fit the poses only when mirrored ({mirrored * 1e3:.1f} mm rms instead "
-            f"of {straight * 1e3:.1f} mm): flip one axis of the scanner's or the robot's frame"
+            f"of {straight * 1e3:.1f} mm)",
+            "flip one axis of the scanner's or the robot's frame",
         )
 
 
@@ -217,7 +218,8 @@ def require_observable(
         raise CalibrationRefused(
             f"the {len(tcps)} flange centres lie on a line along base {in_base(spread.axis, 2)} "
             f"within {spread.farthest * 1e3:.1f} mm{parallel}: rotation about that line is not "
-            "observable; move the arm across it"
+            "observable",
+            "move the arm across it",
         )
     axis = weak.moves[:, 0] / limit
     cure = (
@@ -230,7 +232,8 @@ def require_observable(
     raise CalibrationRefused(
         f"rotation about base {in_base(axis, 2)} is known to "
         f"{np.degrees(weak.excess[0] * limit):.1f} deg only "
-        f"(limit {np.degrees(limit):g} deg) with {noise * 1e3:.1f} mm of noise per axis: {cure}"
+        f"(limit {np.degrees(limit):g} deg) with {noise * 1e3:.1f} mm of noise per axis",
+        cure,
     )
 
 
@@ -351,12 +354,9 @@ def unobservable(
     if mark and np.abs(turns).max() < 0.05:
         return directions
     if _is_configuration(problem):
-        raise CalibrationRefused(
-            f"{_of_what(problem, directions)}: {missing_motion(problem, places)}"
-        )
-    raise CalibrationRefused(
-        _refusal(problem, places, (information, scale), WeakModes(moves, weak.excess), freedoms)
-    )
+        fault, cure = _missing_motion(problem, places)
+        raise CalibrationRefused(f"{_of_what(problem, directions)}: {fault}", cure)
+    raise _refusal(problem, places, (information, scale), WeakModes(moves, weak.excess), freedoms)
 
 
 def _meaningful(problem: Problem, places: Places) -> Floats:
@@ -402,31 +402,31 @@ def _called(problem: Problem, name: str) -> str:
     return known.get(name, "the second base's pose")
 
 
-def missing_motion(problem: Problem, places: Places) -> str:
-    """Return in words which motion of the arms is missing."""
+def _missing_motion(problem: Problem, places: Places) -> tuple[str, str]:
+    """Return what is wrong with the arms' motion, and the motion to add."""
     camera, _ = problem.ends[0]
     if problem.unknown == [camera] and not (problem.seen.ranks == 6).all():
         return _line_of(problem, places)
     for name, poses in _arms(problem):
-        if fault := _fault_of(poses):
-            return f"{name} {fault}"
-    return "the poses are too much alike; spread them, by 20 deg or more about two axes"
+        if found := _fault_of(poses):
+            return f"{name} {found[0]}", found[1]
+    return "the poses are too much alike", "spread them, by 20 deg or more about two axes"
 
 
-def _line_of(problem: Problem, places: Places) -> str:
+def _line_of(problem: Problem, places: Places) -> tuple[str, str]:
     s = problem.seen
     points = s.centres @ places[problem.unknown[0]][:3, :3].T
     spread = spread_of(points)
     if spread.width < IN_LINE * spread.length:
         return (
             f"the {len(points)} centres lie on a line along base {in_base(spread.axis, 2)} within "
-            f"{spread.farthest * 1e3:.1f} mm: rotation about that line is not observable; move the "
-            "arm across it"
+            f"{spread.farthest * 1e3:.1f} mm: rotation about that line is not observable",
+            "move the arm across it",
         )
     return (
-        "the poses are too close together for their noise: spread the poses further, and check "
-        "that each scan belongs to its robot pose, and that the target is where the recipe has it "
-        "(configuration: {place: unknown} finds it)"
+        "the poses are too close together for their noise",
+        "spread the poses further, and check that each scan belongs to its robot pose, and that "
+        "the target is where the recipe has it (configuration: {place: unknown} finds it)",
     )
 
 
@@ -439,9 +439,9 @@ def require_turns(problem: Problem) -> None:
     if not _is_configuration(problem) or len(problem.unknown) < 2:
         return
     for name, poses in _arms(problem):
-        if not _turns(poses):
+        if not _turns(poses) and (found := _fault_of(poses)):
             raise CalibrationRefused(
-                f"the camera's pose is not observable from these poses: {name} {_fault_of(poses)}"
+                f"the camera's pose is not observable from these poses: {name} {found[0]}", found[1]
             )
 
 
@@ -474,8 +474,8 @@ def _refusal(
     known: tuple[Floats, Floats],
     weak: WeakModes,
     freedoms: Mapping[str, Floats] | None,
-) -> str:
-    """Return the message on frames that are not observable, and what would make them so."""
+) -> CalibrationRefused:
+    """Return the refusal of frames that are not observable, with what would make them so."""
     information, scale = known
     named = _named(problem, weak, scale)
     share = np.abs(weak.moves[:, 0] / scale).reshape(-1, 2, 3).max(axis=(0, 2))
@@ -485,10 +485,11 @@ def _refusal(
     untied = left and left.excess[0] > 30.0
     cures = _asked(problem, motions)
     cures += [_tie(problem, _named(problem, left, scale))] if untied else []
-    return (
+    return CalibrationRefused(
         f"the sightings do not determine where {' and '.join(named)} "
         f"{'are' if len(named) > 1 else 'is'}: a common "
-        f"{'turn' if share[0] > share[1] else 'shift'} hardly changes them; {'; '.join(cures)}"
+        f"{'turn' if share[0] > share[1] else 'shift'} hardly changes them",
+        "; ".join(cures),
     )
 
 
@@ -571,12 +572,13 @@ def _turns(poses: Floats) -> bool:
     return bool(np.linalg.norm(_turns_of(poses), axis=1).max() >= NO_MOTION[0])
 
 
-def _fault_of(poses: Floats) -> str | None:
+def _fault_of(poses: Floats) -> tuple[str, str] | None:
+    """Return what is wrong with an arm's poses (N, 4, 4), and the motion to add."""
     turns = _turns_of(poses)
     if _stands_still(poses):
-        return "stood still; move it too"
+        return "stood still", "move it too"
     if not _turns(poses):
-        return "moved without turning; turn it by 20 deg or more about two axes"
+        return "moved without turning", "turn it by 20 deg or more about two axes"
     _, sizes, axes = np.linalg.svd(turns, full_matrices=False)
     # Axes are parallel when they spread by less [rad]
     if sizes[1] > 0.03 * sizes[0]:
@@ -584,10 +586,10 @@ def _fault_of(poses: Floats) -> str | None:
     axis = axes[0] * np.sign(axes[0][np.argmax(np.abs(axes[0]))])
     named = in_base(axis, 2)
     if _about_one_line(poses):
-        return f"turned only its last joint, about {named}; tilt it about another axis too"
+        return f"turned only its last joint, about {named}", "tilt it about another axis too"
     return (
-        f"turned about one axis only, {named}, so that translation along it does not show; tilt "
-        "it about another axis too, or, where it has four joints, set unobservable: mark"
+        f"turned about one axis only, {named}, so that translation along it does not show",
+        "tilt it about another axis too, or, where it has four joints, set unobservable: mark",
     )
 
 

@@ -170,9 +170,9 @@ def other_axes(places: Floats) -> Axes | None:
 
 
 def _costs(readings: list[Reading], pairs: Pairs, robot: RobotModel | None) -> Floats:
-    """Return minus the logarithms of restricted likelihoods, on the samples that agree in all.
+    """Return the negative log restricted likelihood of each reading, on samples without outliers.
 
-    Sixty samples decide between two readings as well as thousands do.
+    All readings use the same samples. Sixty decide between two readings as well as thousands do.
     """
     some = np.unique(np.linspace(0, len(pairs.robot) - 1, 60).round().astype(int))
     kept = np.isin(np.arange(len(pairs.robot)), some)

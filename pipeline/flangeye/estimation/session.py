@@ -34,8 +34,8 @@ from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature
 from flangeye.types.geometry import rigid
 
 CONFIGURED = (
-    "that the recipe's configuration is the cell's (write place: unknown if the target's mounting "
-    "was not measured)"
+    "check that each scan belongs to its robot pose, and that the recipe's configuration is the "
+    "cell's (write place: unknown if the target's mounting was not measured)"
 )
 """Advice if no single answer fits the poses."""
 
@@ -178,8 +178,8 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
     if tilt < np.pi - far:  # a flange whose z points inwards is no mistake of its poses
         raise CalibrationRefused(
             f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis: "
-            "the orientations of the poses are wrong, or belong to another tool frame; 'flangeye "
-            "doctor' tries the orders of quaternions and angles"
+            "the orientations of the poses are wrong, or belong to another tool frame",
+            "'flangeye doctor' tries the orders of quaternions and angles",
         )
     note = (
         f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis, so "
@@ -197,15 +197,16 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
         _require_right_handed(problem, places)
         raise CalibrationRefused(
             f"the poses fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
-            "deg only: check that each scan belongs to its robot pose, and " + CONFIGURED
+            "deg only",
+            CONFIGURED,
         )
     sizes = [np.median(distances(problem.of_pair(k), places)) for k in range(len(problem.ends))]
     camera, target = problem.ends[int(np.argmax(sizes))]
     raise CalibrationRefused(
         f"the sightings fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
-        f"deg only, worst those of {target} by {camera}: check that each belongs to the poses "
-        f"beside it (join: clock_offset, where the clock of {camera} is another), and that the "
-        "cell stands as the recipe states"
+        f"deg only, worst those of {target} by {camera}",
+        "check that each belongs to the poses beside it (join: clock_offset, where the clock of "
+        f"{camera} is another), and that the cell stands as the recipe states",
     )
 
 
@@ -247,8 +248,8 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
     if theirs < 0.1**2 * ours:
         raise CalibrationRefused(
             "what the camera saw fits the poses only when mirrored "
-            f"({np.sqrt(theirs) * 1e3:.1f} mm instead of {np.sqrt(ours) * 1e3:.1f} mm): flip one "
-            "axis of the scanner's or the robot's frame"
+            f"({np.sqrt(theirs) * 1e3:.1f} mm instead of {np.sqrt(ours) * 1e3:.1f} mm)",
+            "flip one axis of the scanner's or the robot's frame",
         )
 
 
@@ -256,8 +257,8 @@ def _require_majority(found: Estimate) -> None:
     agree, given = int(found.inliers.sum()), len(found.inliers)
     if agree < max(3, given / 2):
         raise CalibrationRefused(
-            f"only {agree} of {given} poses fit one calibration: check that each scan belongs "
-            "to its robot pose, and " + CONFIGURED
+            f"only {agree} of {given} poses fit one calibration",
+            CONFIGURED,
         )
 
 
@@ -353,8 +354,8 @@ def _on_one_clock(session: Session) -> Session:
             camera = max(total, key=lambda name: abs(total[name]))
             raise CalibrationRefused(
                 f"the clock of {camera} seems {total[camera] * 1e3:.1f} ms off, and where the arm "
-                "was then is not in the recording: record more before and after each capture, or "
-                "let the arm stand still"
+                "was then is not in the recording",
+                "record more before and after each capture, or let the arm stand still",
             )
         moved = replace(moved.refit(later), notes=session.notes)
     sigmas = [float(np.sqrt(cov[0, 0])) for _, _, cov in moved.found.numbers("clock")]
@@ -381,8 +382,8 @@ def _with_size(session: Session, factor: float) -> Session:
     # Taken for found when it is known to half the prior's deviation
     if known > 0.05:
         raise CalibrationRefused(
-            f"the target's size is known to {known:.1%} only: move the arm further between poses, "
-            "or say target_size: known"
+            f"the target's size is known to {known:.1%} only",
+            "move the arm further between poses, or write target_size: known",
         )
     sigma = known * factor
     digits = max(4, 1 - int(np.floor(np.log10(max(sigma, 1e-9)))))
@@ -425,7 +426,8 @@ def _require_size(session: Session) -> None:
     if gross := _size_far_off(session):
         raise CalibrationRefused(
             f"the target fits the arm's motion far better if it is {gross:.3g} times as large as "
-            "its fit step states: measure the print (target_size: unknown finds it)"
+            "its fit step states",
+            "measure the print (target_size: unknown finds it)",
         )
     share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
     if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(
@@ -436,13 +438,13 @@ def _require_size(session: Session) -> None:
     if kind == "size":
         raise CalibrationRefused(
             f"the arm's motion shows that the target is {factor} large as the fit step states, or "
-            "the camera's focal length wrong by as much: measure the print (size_limit allows "
-            "more, target_size: unknown estimates it)"
+            "the camera's focal length wrong by as much",
+            "measure the print (size_limit allows more, target_size: unknown estimates it)",
         )
     raise CalibrationRefused(
         f"the arm's motion shows that the camera's focal length is {factor} long as its "
-        "calibration says: distances along its axis are off, those across it are not; calibrate "
-        "the camera (acquire.images: {board: …} does; size_limit allows more)"
+        "calibration says: distances along its axis are off, those across it are not",
+        "calibrate the camera (acquire.images: {board: …} does; size_limit allows more)",
     )
 
 

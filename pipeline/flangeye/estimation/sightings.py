@@ -18,7 +18,8 @@ from flangeye.types import Feature, Floats, Motion, Observation, PoseFeature
 from flangeye.types.geometry import basis_of_plane, hat
 
 REACHED = 5e-3
-"""Further from the controller's poses than this [m], the catalogue's arm is another one."""
+"""Distance of a reported flange from the model's kinematics [m] beyond which the model is taken
+for another arm's."""
 
 
 def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:

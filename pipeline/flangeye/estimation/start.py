@@ -65,7 +65,9 @@ def initial_guess(problem: Problem, search: bool = True) -> tuple[Places, Floats
         if len(problem.ends) == 1 or _plausible(problem, found[1]):
             return found
     if not search:
-        raise CalibrationRefused("the closed forms give no plausible start")
+        raise CalibrationRefused(
+            "the closed forms give no plausible start", "spread the poses, and tilt them more"
+        )
     elsewhere = _anywhere(problem, rng)
     if places is None or _cost(problem, elsewhere[1]) < _cost(problem, found[1]):
         return elsewhere
@@ -233,24 +235,24 @@ def distances(problem: Problem, places: Places) -> Floats:
     return np.asarray((LEVER**2 * r[:, :3] ** 2).sum(axis=1) + (r[:, 3:] ** 2).sum(axis=1))
 
 
-class _Form(NamedTuple):
+class _LoopSolver(NamedTuple):
     """A closed form: how many sightings it needs, and a function from sightings to places."""
 
     fewest: int
     solve: Callable[[Indices, np.random.Generator], dict[str, Floats]]
 
 
-def _form_of(loop: _Loop) -> _Form | None:
+def _form_of(loop: _Loop) -> _LoopSolver | None:
     """Return the closed form of a loop; None where there is none."""
     whole, count = bool((loop.seen.ranks == 6).all()), len(loop.unknown)
     if whole and count <= 3:
-        return _Form({1: 1, 2: 3, 3: 6}[count], lambda rows, rng: _of_poses(loop, rows, rng))
+        return _LoopSolver({1: 1, 2: 3, 3: 6}[count], lambda rows, rng: _of_poses(loop, rows, rng))
     if count == 1:
         of_point = loop.unknown[0] == loop.target[-2] if len(loop.target) > 1 else False
-        return _Form(1 if of_point else 3, lambda rows, rng: _of_points(loop, rows))
+        return _LoopSolver(1 if of_point else 3, lambda rows, rng: _of_points(loop, rows))
     if count == 2 and len(loop.camera) == len(loop.target) == 3:
         fewest = 5 if (loop.seen.ranks >= 5).all() else 8
-        return _Form(fewest, lambda rows, rng: _linear(loop, rows))
+        return _LoopSolver(fewest, lambda rows, rng: _linear(loop, rows))
     return None
 
 
@@ -272,8 +274,8 @@ def start_of_circles(problem: Problem) -> dict[str, Floats]:
     form = _form_of(loop)
     if form is None:
         raise CalibrationRefused(
-            "two arms with a circle at an unknown place cannot be solved: state its place, which "
-            "is known for the flange's own circle, or use a marker"
+            "two arms with a circle at an unknown place cannot be solved",
+            "state its place, which is known for the flange's own circle, or use a marker",
         )
     rows = np.arange(len(loop.seen))
     return form.solve(rows, np.random.default_rng(0))
@@ -327,7 +329,7 @@ def _of_two_arms(
 
 
 def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
-    """Return the one unknown of circles or centres, by a rigid fit of points to seen points."""
+    """Return the only unknown place of a loop of centres, by a rigid fit to known points."""
     name, s = loop.unknown[0], loop.seen
     on_camera = len(loop.camera) > 1
     moved, other = (loop.camera, loop.target) if on_camera else (loop.target, loop.camera)
@@ -415,8 +417,8 @@ def _anywhere(problem: Problem, rng: np.random.Generator) -> tuple[Places, Float
             break
     if best is None:
         raise CalibrationRefused(
-            "no closed form gives a start for these poses: spread them, and turn the arm about two "
-            "axes at least"
+            "no closed form gives a start for these poses",
+            "spread them, and turn the arm about two axes at least",
         )
     return best
 

@@ -48,7 +48,7 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
             stand_in.lay_out()
             yield root
         except FlangeyeError as error:
-            error.args = tuple(with_urls(str(each)) for each in error.args)
+            error.wrong, error.advice = with_urls(error.wrong), with_urls(error.advice)
             raise
         finally:
             del _STANDING_IN[root]
@@ -74,7 +74,7 @@ def results_at(place: str | None) -> Iterator[Path | None]:
         try:
             yield local
         except FlangeyeError as error:
-            error.args = tuple(with_urls(str(each)) for each in error.args)
+            error.wrong, error.advice = with_urls(error.wrong), with_urls(error.advice)
             raise
         finally:
             if local.is_dir():
@@ -199,7 +199,7 @@ def system_of(url: str) -> tuple[Any, str]:
         protocol = each.partition("://")[0]
         if "://" in each and protocol not in protocols:
             raise StageError(
-                f"{url}: {protocol}:// is not known; {', '.join(f'{p}://' for p in protocols)} are"
+                f"{url}: no {protocol}:// is read; known: {', '.join(f'{p}://' for p in protocols)}"
             )
     try:
         import fsspec

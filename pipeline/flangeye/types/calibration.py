@@ -234,12 +234,14 @@ class Verification:
         reason: One line: the figure and its limit.
         figures: Named results in SI units.
         errors: Per-pose errors on poses that took no part [m], by observation id.
+        advice: The next step after a failure; empty if the verification knows none.
     """
 
     passed: bool
     reason: str
     figures: Mapping[str, float]
     errors: Mapping[str, float] = field(default_factory=dict)
+    advice: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,6 +61,5 @@ def _tried(
         try:
             found[name] = reader(path, **arm)
         except NotThisLayout as error:
-            cause, _, _ = str(error).removeprefix(f"{path}: ").partition("; ")
-            missed.append(f"{name} ({cause})")
+            missed.append(f"{name} ({error.wrong.removeprefix(f'{path}: ')})")
     return found, missed

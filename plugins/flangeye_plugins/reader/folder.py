@@ -90,8 +90,8 @@ def _poses_file(path: Path) -> Path:
     if not found:
         clouds = sum(1 for p in path.glob("*") if p.suffix.lower() in CLOUD_SUFFIXES)
         but = f"clouds ({clouds}), but " if clouds else ""
-        advice = f"; 'flangeye init {path}' writes a recipe for other layouts"
-        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(named)}{advice}")
+        advice = f"'flangeye init {path}' writes a recipe for other layouts"
+        raise NotThisLayout(f"{path}: holds {but}none of {', '.join(named)}", advice)
     if len(found) > 1:
         raise StageError(f"{path}: holds {' and '.join(f.name for f in found)}; keep one of them")
     return found[0]
@@ -111,6 +111,7 @@ def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> Le
 
 def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
     cloud, image = (None if name is None else _scan(root, name) for name in (row.cloud, row.image))
+    # A depth image in the column of clouds is a cloud, any other image is none
     if cloud and cloud.suffix.lower() in IMAGES and not is_cloud(cloud):
         cloud, image = None, image or cloud
     name = row.id or (cloud or image or root).stem
@@ -140,6 +141,7 @@ def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
 
 
 def _refuse_unpaired(file: Path, recordings: Iterable[Recording]) -> None:
+    # A cloud that is left over hints at a row that was lost, after which all pairs may be shifted
     known = {with_companion(recording).cloud for recording in recordings}
     for path in sorted(file.parent.iterdir()):
         if path.suffix.lower() in CLOUD_SUFFIXES and path not in known:
@@ -237,6 +239,7 @@ def _cells(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the heading, and line number and cells of every further row that is not blank."""
     text = read_text(file)
     try:
+        # Spreadsheets separate cells by semicolons where the comma is the decimal mark
         mark = ";" if ";" in text.partition("\n")[0] else ","
         reader = csv.reader(text.splitlines(), delimiter=mark, strict=True)
         rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader if any(row)]

@@ -66,14 +66,15 @@ def seam_cad(
     if scan.places:
         raise CalibrationRefused(
             f"{STAGE}: the scan is put together from {len(scan.places)} places, and a CAD is "
-            "registered to what one place sees; plan the seam with seam.joint"
+            "registered to what one place sees",
+            "plan the seam with seam.joint",
         )
     seen = seen_in_base(STAGE, scan, answer, robot)
     found = register(seen.points, workpiece, seam, _limits(params))
     turn, shift = found.fit.pose[:3, :3], found.fit.pose[:3, 3]
     dense = resampled(np.hstack([seam.points, seam.openings]), SPACING)
     line = dense[:, :3] @ turn.T + shift
-    distortion = DistortionField(scanner).at if scanner else _undistorted
+    distortion = DistortionField(scanner).at if scanner else lambda at: np.zeros((len(at), 3, 1))
     of_fit = found.fit.covariance(params.model_error, distortion)
     covariances = covariance_at(of_fit, shift, line)
     if seam.closed:  # moved along itself it stays where it is
@@ -117,7 +118,8 @@ def _deviation(covariances: Floats, limit: float) -> float:
         raise CalibrationRefused(
             f"{STAGE}: the scan does not determine where the seam lies along ({way}) in camera: "
             f"standard deviation {deviation * 1e3:.2g} mm, limit {limit * 1e3:g} mm "
-            "(max_deviation); let the scanner see more of the part"
+            "(max_deviation)",
+            "let the scanner see more of the part",
         )
     return deviation
 
@@ -138,7 +140,3 @@ def _limits(params: CadParams) -> RegistrationLimits:
     # that other parts have alike; a twentieth of what was seen may be missing, and the best pose is
     # three percent better than the second.
     return RegistrationLimits(0.25, 0.05, params.max_residual, 0.03)
-
-
-def _undistorted(points: Floats) -> Floats:
-    return np.zeros((len(points), 3, 1))

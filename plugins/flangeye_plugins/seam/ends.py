@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from flangeye.types import Floats, Mask
 from flangeye_plugins.seam.sweep import Sweep
-from flangeye_plugins.seam.template import EDGES, Section
+from flangeye_plugins.seam.template import EDGES
 
 FEWEST_LANES = 5
 """Smallest number of lanes from which an end is estimated."""
@@ -50,7 +50,8 @@ def face_ends(
     found, which = [np.zeros((0, 5))], [np.zeros(0, dtype=int)]
     for edge in joint.unseen:
         face = edge - 1
-        on = _on_face(section, q, face, tolerance) & (np.abs(away) < 8 * tolerance)
+        on = np.abs(q @ section.normals[face] - section.heights[face]) < tolerance
+        on &= np.abs(away) < 8 * tolerance
         on &= (active == face) | (active == edge)
         beside = q[on] @ section.normals[edge] - section.heights[edge]
         # Farther in on the plate nothing shows its edge; far beyond the edge is another part.
@@ -67,10 +68,6 @@ def face_ends(
         found.append(local[at[last]] + more[:, None] * out)
         which.append(np.full(len(last), edge))
     return np.concatenate(found), np.concatenate(which)
-
-
-def _on_face(section: Section, q: Floats, face: int, tolerance: float) -> Mask:
-    return np.asarray(np.abs(q @ section.normals[face] - section.heights[face]) < tolerance)
 
 
 @dataclass(frozen=True)

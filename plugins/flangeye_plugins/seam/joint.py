@@ -149,8 +149,8 @@ def _refuse_apart(seen: PlacedScan) -> None:
     if seen.apart is not None and seen.apart > limit:
         raise CalibrationRefused(
             f"{STAGE}: neighbouring clouds are {seen.apart * 1e3:.2f} mm apart where both show the "
-            f"same face, limit {limit * 1e3:g} mm; calibrate the scanner on "
-            "the flange again"
+            f"same face, limit {limit * 1e3:g} mm",
+            "calibrate the scanner on the flange again",
         )
 
 
@@ -234,7 +234,8 @@ def _placed(rough: Curve, local: Floats, normals: Floats, params: JointParams) -
     if not ways:
         raise CalibrationRefused(
             f"{STAGE}: no {params.joint} joint within {params.reach * 1e3:g} mm of the line "
-            "(reach); is it the right joint, and seen?"
+            "(reach)",
+            "name the joint that is there (joint), and see that the scan shows it",
         )
     scores = [sum(place.score for place in way) for way in ways]
     # A joint that explains this share of what the best one explains is its equal
@@ -242,8 +243,8 @@ def _placed(rough: Curve, local: Floats, normals: Floats, params: JointParams) -
     if len(ways) > 1 and scores[1] > equal * scores[0]:
         raise CalibrationRefused(
             f"{STAGE}: ambiguous: a second {params.joint} joint is as good, "
-            f"{_between(ways[0], ways[1]) * 1e3:.0f} mm beside the first; move the line nearer to "
-            "one of them and lower 'reach'"
+            f"{_between(ways[0], ways[1]) * 1e3:.0f} mm beside the first",
+            "move the line nearer to one of them and lower 'reach'",
         )
     return ways[0]
 
@@ -340,41 +341,36 @@ def _judged(found: FoundJoint, params: JointParams) -> dict[str, float]:
     limits = [
         (found.swept.sigma, params.max_residual, "points are {} from the joint", " (max_residual)"),
         (deviation, params.max_deviation, "the seam is known to {} (1 sigma)", " (max_deviation)"),
-        *(
-            (value, 1e-3, f"its {end} is known to {{}} (1 sigma)", "")
-            for end, value in ends.items()
-        ),
+        *((x, 1e-3, f"its {end} is known to {{}} (1 sigma)", "") for end, x in ends.items()),
     ]
     for value, limit, what, name in limits:
         if not value <= limit:
             told = what.format(f"{value * 1e3:.3g} mm")
-            raise CalibrationRefused(f"{STAGE}: {told}, limit {limit * 1e3:g} mm{name}")
+            raise CalibrationRefused(
+                f"{STAGE}: {told}, limit {limit * 1e3:g} mm{name}", "scan more densely, or nearer"
+            )
     # Before the angles: on a single plane any joint's angles fit somehow.
     _refuse_plane(found)
     leaning = np.abs(found.swept.section.shape[:4]) - 3 * np.radians(
         JOINT_SHAPES[params.joint].spread
     )
-    if leaning.max() > 0:
-        raise CalibrationRefused(
-            f"{STAGE}: this is not a {params.joint} joint: an angle between its surfaces is off by "
-            f"{np.degrees(np.abs(found.swept.section.shape[:4]).max()):.0f} deg"
-        )
     # Of a joint, most points about its line are on it, and most of its length shows both plates.
     shares = {
         "of the points about the line are on it": explained,
         "of its length show both plates": coverage,
     }
-    for what, value in shares.items():
-        if value < 0.6:
-            raise CalibrationRefused(
-                f"{STAGE}: this is not a {params.joint} joint: {value:.0%} {what}, at least 60% "
-                "are needed"
-            )
+    wrong = [f"{x:.0%} {what}, at least 60% are needed" for what, x in shares.items() if x < 0.6]
+    if leaning.max() > 0:
+        off = np.degrees(np.abs(found.swept.section.shape[:4]).max())
+        wrong.insert(0, f"an angle between its surfaces is off by {off:.0f} deg")
+    if wrong:
+        told = f"{STAGE}: this is not a {params.joint} joint: {wrong[0]}"
+        raise CalibrationRefused(told, "name the joint that is there (joint)")
     if astray is not None:
         raise CalibrationRefused(
             f"{STAGE}: from {astray[0] * 1e3:.0f} to {astray[1] * 1e3:.0f} mm along it most points "
-            f"are not on the {params.joint} joint that was found; give more rough points there, or "
-            "end the line before"
+            f"are not on the {params.joint} joint that was found",
+            "give more rough points there, or end the line before",
         )
     return {
         "residual": found.swept.sigma,
@@ -397,7 +393,8 @@ def _refuse_plane(found: FoundJoint) -> None:
         plane = 0.95  # as good as the joint
         if level[on].mean(axis=0).max(initial=0.0) > plane:
             raise CalibrationRefused(
-                f"{STAGE}: no joint is seen: one plane explains {plane:.0%} of the points as well"
+                f"{STAGE}: no joint is seen: one plane explains {plane:.0%} of the points as well",
+                "let the scan show both plates",
             )
         return
     # A point stands for a square of the pitch: so much of the gap's area has points in it
@@ -407,7 +404,8 @@ def _refuse_plane(found: FoundJoint) -> None:
     if gap < 2 * pitch or filled > 1 / 3:
         raise CalibrationRefused(
             f"{STAGE}: no gap is seen: {gap * 1e3:.2f} mm, {filled:.0%} of it filled, with points "
-            f"{pitch * 1e3:.2f} mm apart; scan nearer, or take another joint"
+            f"{pitch * 1e3:.2f} mm apart",
+            "scan nearer, or name another joint",
         )
 
 

@@ -56,7 +56,8 @@ def answer_for(stage: str, calibration: HandEye, params: SeamParams) -> HandEye:
     if corrected is None:
         raise CalibrationRefused(
             f"{stage}: the recipe asks for arm: corrected, but the calibration found no arm "
-            "error worth correcting; write arm: as-reported"
+            "error worth correcting",
+            "write arm: as-reported",
         )
     return corrected
 
@@ -85,8 +86,8 @@ def for_the_controller(
         told = [reported_flange(pose, correction, arm) @ tip for pose in poses]
     except ValueError as error:
         raise CalibrationRefused(
-            f"the seam cannot be corrected for the arm's error: {error}; move the workpiece to "
-            "where the arm was calibrated, or write arm: as-reported"
+            f"the seam cannot be corrected for the arm's error: {error}",
+            "move the workpiece to where the arm was calibrated, or write arm: as-reported",
         ) from None
     note = "points are commands for the controller, with the arm's estimated error taken off"
     return replace(seam, points_in_base=np.array(told)[:, :3], notes=(*seam.notes, note))
@@ -129,8 +130,8 @@ def refuse_outside(stage: str, points_in_base: Floats, workspace: Box | None) ->
         point = ", ".join(f"{1e3 * x:.0f}" for x in points_in_base[worst[0]])
         raise CalibrationRefused(
             f"{stage}: the seam leaves the workspace by {1e3 * beyond[worst]:.0f} mm along "
-            f"{'xyz'[worst[1]]}, at ({point}) mm in base; move the workpiece, or widen the "
-            "recipe's workspace and calibrate over it"
+            f"{'xyz'[worst[1]]}, at ({point}) mm in base",
+            "move the workpiece, or widen the recipe's workspace and calibrate over it",
         )
 
 

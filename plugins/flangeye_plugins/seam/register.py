@@ -76,12 +76,13 @@ def register(
     found = [one for one in search.everywhere() if one.verdict.score > 0]
     fit = _laid(scan, looks, found[0].pose) if found else None
     if fit is None:
-        raise CalibrationRefused(f"{STAGE}: the part is nowhere in the scan; {_look(workpiece)}")
+        raise CalibrationRefused(f"{STAGE}: the part is nowhere in the scan", _look(workpiece))
     best, seen = found[0].verdict.score, found[0].seen
     if seen < limits.seen:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: {seen:.0%} of the part's broadest side is in the scan, at least "
-            f"{limits.seen:.0%} is needed; {_look(workpiece)}"
+            f"{limits.seen:.0%} is needed",
+            _look(workpiece),
         )
     goes_on = found[0].verdict.goes_on / max(found[0].verdict.agree, 1)
     refuted = goes_on + search.refuted(fit.pose, lambda at: np.ones(len(at), dtype=bool))
@@ -89,7 +90,8 @@ def register(
     if fit.noise > limits.residual:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: the scan is {fit.noise * 1e3:.3f} mm off the CAD, limit "
-            f"{limits.residual * 1e3:g} mm (max_residual); {_look(workpiece)}"
+            f"{limits.residual * 1e3:g} mm (max_residual)",
+            _look(workpiece),
         )
     reach = max(2 * (seam.half_width or 0.0), AROUND * looks.size)
     beside = search.refuted(fit.pose, lambda at: distances_to_line(at, seam.points) < reach)
@@ -163,12 +165,13 @@ def _refuse_missing(
     if share > limits.refuted:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: the scanner sees through {share:.0%} of {what}, at most "
-            f"{limits.refuted:.0%} is allowed; {_look(workpiece)}"
+            f"{limits.refuted:.0%} is allowed",
+            _look(workpiece),
         )
 
 
 def _look(workpiece: Workpiece) -> str:
-    return f"is it {workpiece.title!r} ({workpiece.path.name}), and in view?"
+    return f"check that the part is {workpiece.title!r} ({workpiece.path.name}), and in view"
 
 
 def _refuse_ambiguous(best: Floats, other: Floats, apart: float, second: float) -> None:
@@ -180,6 +183,7 @@ def _refuse_ambiguous(best: Floats, other: Floats, apart: float, second: float) 
         moved = f"shifted by {1e3 * apart:.0f} mm"
     raise CalibrationRefused(
         f"{STAGE}: ambiguous: the part {moved} agrees with the scan {second:.0%} as well, and its "
-        f"seam would be up to {1e3 * apart:.0f} mm away; scan it so that a feature shows which way "
-        "it lies, or find the seam without CAD (seam.joint)"
+        f"seam would be up to {1e3 * apart:.0f} mm away",
+        "scan it so that a feature shows which way it lies, or find the seam without CAD "
+        "(seam.joint)",
     )

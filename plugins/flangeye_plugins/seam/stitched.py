@@ -98,7 +98,7 @@ def seen_in_base(
     if of_flange != bool(scan.places):
         told = "rides on the flange" if of_flange else "stands beside the arm"
         use = "scan.along" if of_flange else "scan.live or scan.file"
-        raise CalibrationRefused(f"{stage}: the scanner {told}; scan the workpiece with {use}")
+        raise CalibrationRefused(f"{stage}: the scanner {told}", f"scan the workpiece with {use}")
     points = scan.cloud.points().astype(np.float64)
     if not scan.places:
         return PlacedScan(camera.transform, _AsOnePlace(answer), np.zeros((1, 3)), (points,))

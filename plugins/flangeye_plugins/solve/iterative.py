@@ -169,8 +169,8 @@ def solve_pool(pool: Sequence[Observation]) -> Transform:
 def _require_finite(search: SearchState, seen: int) -> None:
     if not np.isfinite(search.cost):
         raise CalibrationRefused(
-            f"no pool of {len(search.pool)} out of {seen} poses gives a finite error; check the "
-            "verification view and the flange's model, or set error: holdout"
+            f"no pool of {len(search.pool)} out of {seen} poses gives a finite error",
+            "check the verification view and the flange's model, or set error: holdout",
         )
 
 

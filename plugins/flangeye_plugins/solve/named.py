@@ -78,7 +78,9 @@ def solve_closed(
     try:
         places = solver(problem)
     except np.linalg.LinAlgError:  # as where all turns are about one axis
-        raise CalibrationRefused(f"{method}: its equations have no solution here") from None
+        raise CalibrationRefused(
+            f"{method}: its equations have no solution here", "turn the arm about two axes at least"
+        ) from None
     # A closed form has no noise model: the covariance of its answer is from the mixed model
     options = Options(params.limits)
     return calibrate_at(places, observations, cell, scanner, options, method)

@@ -53,4 +53,7 @@ def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
     }
     if found.state == "OK":
         return Verification(True, f"the cell stands where {stored.path} found it", figures)
-    return Verification(False, f"the cell has moved since {stored.path}, by {shift}", figures)
+    return Verification(
+        False, f"the cell has moved since {stored.path}, by {shift}", figures,
+        advice="put the scanner back; or take verify.drift out of the recipe and use the new pose",
+    )  # fmt: skip

@@ -91,9 +91,8 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     try:
         solved = solve_without(calibration, solve, deals)
     except (StageError, CalibrationRefused) as error:
-        return Verification(
-            False, f"the calibration without one of {len(deals)} folds fails: {error}", {}
-        )
+        why = f"the calibration without one of {len(deals)} folds fails: {error.wrong}"
+        return Verification(False, why, {}, advice=error.advice)
     standing = cell or cell_of(configuration or DEFAULT, robot, second.model if second else None)
     used = np.array([pair.used for pair in calibration.pairs])
     held = hold_out(poses, deals, [each.as_reported() for each in solved], standing)
@@ -107,11 +106,12 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
         answers = [each.as_corrected() or each.as_reported() for each in solved]
         corrected = _figures(hold_out(poses, deals, answers, standing), counted)
         figures |= {f"corrected_{name}": corrected[name] for name in ("rms", "median", "p95")}
-    passed, reason = _judge(figures, params)
-    if passed and (why := _misread(calibration, standing, params.optical)):
-        passed, reason = False, why
+    passed, reason, advice = _judge(figures, params)
+    misread = _misread(calibration, standing, params.optical) if passed else None
+    if misread:
+        passed, (reason, advice) = False, misread
     errors = {o.id: float(norm) for o, norm in zip(poses, norms, strict=True)}
-    return Verification(passed, reason, figures, errors)
+    return Verification(passed, reason, figures, errors, advice)
 
 
 def deal(count: int, folds: int, seed: int) -> list[Indices]:
@@ -211,8 +211,8 @@ def _figures(held: HeldOut, counted: Mask) -> dict[str, float]:
     return {**figures, "tilt_rms": rms(tilts)} if len(tilts) else figures
 
 
-def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
-    """Return a more plausible interpretation of arm and marker poses; None if there is none."""
+def _misread(calibration: HandEye, cell: Cell, optical: bool) -> tuple[str, str] | None:
+    """Return a more plausible interpretation of arm and marker poses, and what to do about it."""
     seen = [o for pair in calibration.pairs if pair.used for o in [pair.observation]]
     shown = [o.feature.camera_T_target for o in seen if isinstance(o.feature, PoseFeature)]
     if (
@@ -239,35 +239,34 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> str | None:
         return (
             f"{carried.child} would be {near:.2f} m from the flange, and {standing.child} "
             f"{far:.2f} m from the base: probably {readings[0].mistake(pairs.in_hand)}, which fits "
-            "as well; if the distances are right, state the target's place (configuration: "
-            "{place: …})"
+            "as well",
+            "if the distances are right, state the target's place (configuration: {place: …})",
         )
     axes = other_axes(markers[:, :3, 3]) if optical else None
     side = {"opengl": "behind", "ros": "beside"}
     return axes and (
-        f"all targets are {side[axes]} the camera: z of its frame is not forward; if that is "
-        "intended, write verify.holdout: {optical: false}"
+        f"all targets are {side[axes]} the camera: z of its frame is not forward",
+        "if that is intended, write verify.holdout: {optical: false}",
     )
 
 
-def _judge(figures: dict[str, float], params: HoldoutParams) -> tuple[bool, str]:
+def _judge(figures: dict[str, float], params: HoldoutParams) -> tuple[bool, str, str]:
+    """Return whether the calibration passed, why, and the next step if one is known."""
     outliers, poses = int(figures["outliers"]), int(figures["poses"])
     # Before the error: with most poses set aside the rest may well agree, on a wrong answer.
     if outliers > params.max_outliers * poses:
-        return False, (
-            f"{outliers} of {poses} poses are outliers, limit {params.max_outliers:.0%}: "
-            "look at the scans the solver set aside"
-        )
+        told = f"{outliers} of {poses} poses are outliers, limit {params.max_outliers:.0%}"
+        return False, told, "look at the scans the solver set aside"
     passed, tilt = figures["rms"] <= params.max_rms, figures.get("tilt_rms", 0.0)
     aside = f" ({outliers} of {poses} poses set aside)" if outliers else ""
     sign = "within" if passed else "above"
     told = f"held-out error {figures['rms'] * 1e3:.3f} mm rms"
     # Positions alone can fit with orientations read in a wrong convention.
     if passed and tilt > params.max_tilt:
-        return False, (
+        told = (
             f"the measured orientations are off by {np.degrees(tilt):.1f} deg rms on poses held "
             f"out, limit {np.degrees(params.max_tilt):g} deg, while positions fit to "
-            f"{figures['rms'] * 1e3:.3f} mm: the angles were read wrongly; 'flangeye doctor' tries "
-            "other conventions"
+            f"{figures['rms'] * 1e3:.3f} mm: the angles were read wrongly"
         )
-    return passed, f"{told}{aside}, {sign} the limit of {params.max_rms * 1e3:g} mm"
+        return False, told, "'flangeye doctor' tries other conventions"
+    return passed, f"{told}{aside}, {sign} the limit of {params.max_rms * 1e3:g} mm", ""

@@ -154,8 +154,8 @@ def test_millimetres_beside_metres_are_refused() -> None:
     with pytest.raises(CalibrationRefused) as refused:
         solve(1000 * to_camera(tcps), tcps)
     assert str(refused.value) == (
-        "the circle centres are 1000 times as far apart as the robot's poses: "
-        "both must be in metres, and each scan must belong to its pose"
+        "the circle centres are 1000 times as far apart as the robot's poses; check that both are "
+        "in metres, and that each scan belongs to its robot pose"
     )
 
 

@@ -43,3 +43,4 @@ def test_a_cell_that_moved_is_refused(run: Path, shift: float, passed: bool) -> 
         said = f", by {1e3 * found.figures['shift']:.2f} mm at the work's worst corner"
         assert found.reason == f"the cell has moved since {run / 'run.mcap'}{said}"
         assert found.figures["turn"] < 4e-4, "it was shifted, not turned"
+        assert found.advice.startswith("put the scanner back; or take verify.drift out")

@@ -101,6 +101,13 @@ def test_a_refusal_comes_first_and_its_matrix_is_not_offered(make_run: Make) -> 
     assert "data-copies=" not in render(log).partition("<main>")[2].partition("<script>")[0]
 
 
+def test_a_refusal_says_what_to_do_next(make_run: Make) -> None:
+    facts = facts_of(make_run(solved=False, refused="the arm stood still"))
+    known = facts.result.model_copy(update={"advice": "move it too"})
+    told = [banner_of(replace(facts, result=each)).sentence for each in (facts.result, known)]
+    assert told == ["The arm stood still", "The arm stood still. Next step: move it too"]
+
+
 def test_refused_before_solving_shows_no_residuals(make_run: Make) -> None:
     log = make_run(solved=False, refused="the flange's centres lie on a line")
     text = text_of(log)

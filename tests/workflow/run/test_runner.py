@@ -312,11 +312,12 @@ def test_what_is_read_back_took_no_time(execute: Callable[..., Any]) -> None:
 def test_what_refuses_before_it_solves_keeps_what_was_seen(execute: Callable[..., Any]) -> None:
     def refuse(observations, params):
         list(observations)
-        raise CalibrationRefused("no motion")
+        raise CalibrationRefused("no motion", "move the arm")
 
     with replaced(toy.solve, refuse):
         result, _ = execute(TOY_RECIPE)
     assert (result.status, result.refused) == ("refused", "no motion")
+    assert result.advice == "move the arm"
     assert [o.id for o in result.observations] == [f"{k:03d}" for k in range(6)]
     assert {(o.used, o.reason) for o in result.observations} == {(False, "refused before solving")}
 

@@ -32,8 +32,9 @@ def daniilidis(motions: Motions) -> Floats:
     candidates = [_normalised(s * u + t * v) for s, t in _ratios(a, b, c)]
     if not candidates:
         raise CalibrationRefused(
-            "no single transform fits all motions: check that each scan belongs to its "
-            "robot pose, and turn the arm about two axes at least"
+            "no single transform fits all motions",
+            "check that each scan belongs to its robot pose, and turn the arm about two axes at "
+            "least",
         )
     real, dual = min(candidates, key=lambda q: float(np.linalg.norm(rows @ np.concatenate(q))))
     # t = 2 dual * conjugate(real), the quaternions being scalar first.

@@ -182,6 +182,6 @@ def _require_rest(count: int, resting: str, moving: str) -> None:
     if count < 3:
         raise CalibrationRefused(
             f"the {resting} arm stands still at {count} poses at most, and 3 are needed at which "
-            f"only the {moving} moves: record such poses, or use solve.robust, which "
-            "needs none"
+            f"only the {moving} moves",
+            "record such poses, or use solve.robust, which needs none",
         )

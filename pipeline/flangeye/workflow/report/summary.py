@@ -36,8 +36,9 @@ def banner_of(facts: Facts) -> Banner:
     result = facts.result
     figures = ["SIMULATED"] if result.simulated else []
     if result.status == "refused":
-        reason = result.refused or "no reason was given"
-        return Banner("refused", "Refused", figures, _sentence(reason))
+        reason = _sentence(result.refused or "no reason was given")
+        advice = f". Next step: {result.advice}" if result.advice else ""
+        return Banner("refused", "Refused", figures, reason + advice)
     if result.status == "incomplete":
         return Banner("incomplete", "Incomplete", figures, _sentence(_how_far(facts)))
     if found := sections.expected_error(result):

@@ -78,8 +78,8 @@ def calibrated_pose(
         raise StageError(f"there is no calibration to export: {result.refused or result.status}")
     if result.refused and not anyway:
         raise CalibrationRefused(
-            f"the calibration was refused, so nothing is exported: {result.refused}; --anyway "
-            "writes it all the same, and says so in the file"
+            f"the calibration was refused, so nothing is exported: {result.refused}",
+            "--anyway writes it all the same, and says so in the file",
         )
     names = [_of_camera(result, camera)] if camera else [*result.transforms]
     if not cameras_of(result):

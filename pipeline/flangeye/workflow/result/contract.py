@@ -19,11 +19,11 @@ Point = Annotated[Vector, Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[list[float]], BeforeValidator(_listed)]
 
 
-class _Part(Described):
+class _ResultPart(Described):
     model_config = ConfigDict(extra="forbid", defer_build=True, from_attributes=True)
 
 
-class TransformResult(_Part):
+class TransformResult(_ResultPart):
     """An estimated transform with its uncertainty."""
 
     matrix: Matrix
@@ -76,7 +76,7 @@ def _require_covariance(rows: Matrix) -> None:
         raise ValueError("'covariance' has a variance below 0, or a correlation beyond 1")
 
 
-class ObservationResult(_Part):
+class ObservationResult(_ResultPart):
     """One capture and its outcome; measured values are null if it was rejected early."""
 
     id: str
@@ -117,7 +117,7 @@ class ObservationResult(_Part):
         return self
 
 
-class HoldoutResult(_Part):
+class HoldoutResult(_ResultPart):
     """Errors on poses that took no part in the estimate."""
 
     folds: int
@@ -128,7 +128,7 @@ class HoldoutResult(_Part):
     """Everything else verify.holdout reports."""
 
 
-class VerificationResult(_Part):
+class VerificationResult(_ResultPart):
     """Result of one verify step."""
 
     passed: bool
@@ -136,16 +136,18 @@ class VerificationResult(_Part):
     figures: dict[str, float]
     errors: dict[str, float]
     """Error of each pose [m], by observation id."""
+    advice: str = ""
+    """The next step after a failure; empty if the verification knows none."""
 
 
-class WorkspaceResult(_Part):
+class WorkspaceResult(_ResultPart):
     """Where the work is."""
 
     centre: Point
     size: Point
 
 
-class ExpectedErrorResult(_Part):
+class ExpectedErrorResult(_ResultPart):
     """Expected error when the arm is sent to a scanned point."""
 
     rms: float
@@ -154,7 +156,7 @@ class ExpectedErrorResult(_Part):
     """95 % of the errors are below [m]."""
 
 
-class TransformErrorResult(_Part):
+class TransformErrorResult(_ResultPart):
     """Simulation only: true error of one transform."""
 
     rotation: float
@@ -163,7 +165,7 @@ class TransformErrorResult(_Part):
     """Error of the point its covariance is taken about [m]."""
 
 
-class TruthResult(_Part):
+class TruthResult(_ResultPart):
     """Simulation only: the calibration's true error."""
 
     base_T_camera: Matrix | None = None
@@ -185,7 +187,7 @@ class TruthResult(_Part):
     """The same for the corrected arm and its pose of the camera [m]."""
 
 
-class SeamTruthResult(_Part):
+class SeamTruthResult(_ResultPart):
     """Simulation only: true error of the planned seam."""
 
     rms: float
@@ -195,7 +197,7 @@ class SeamTruthResult(_Part):
     """Share of the planned points whose tube holds it."""
 
 
-class SeamResult(_Part):
+class SeamResult(_ResultPart):
     """The planned seam, in the base."""
 
     source: str
@@ -219,7 +221,7 @@ class SeamResult(_Part):
     truth: SeamTruthResult | None = None
 
 
-class WeldTruthResult(_Part):
+class WeldTruthResult(_ResultPart):
     """Simulation only: the torch's true distance across the seam, after the lead-in."""
 
     rms: float
@@ -227,7 +229,7 @@ class WeldTruthResult(_Part):
     max: float
 
 
-class WeldResult(_Part):
+class WeldResult(_ResultPart):
     """Result of the weld."""
 
     mode: str
@@ -244,7 +246,7 @@ class WeldResult(_Part):
     truth: WeldTruthResult | None = None
 
 
-class FieldResult(_Part):
+class FieldResult(_ResultPart):
     """A smooth displacement over the workspace; flangeye.maths.arm_correction evaluates it."""
 
     about: Point
@@ -255,7 +257,7 @@ class FieldResult(_Part):
     """Weights of the K features [m]."""
 
 
-class CorrectionResult(_Part):
+class CorrectionResult(_ResultPart):
     """Estimated errors of the arm, with which its poses can be corrected."""
 
     tool_offset: Point
@@ -270,7 +272,7 @@ class CorrectionResult(_Part):
     """Smooth displacement of the flange, to add to where the arm reports it."""
 
 
-class AnswerResult(_Part):
+class AnswerResult(_ResultPart):
     """The pose for one arm: as its controller reports it, or corrected."""
 
     transforms: dict[str, TransformResult]
@@ -284,7 +286,7 @@ class AnswerResult(_Part):
     """Error on held-out poses, over all of them [m]."""
 
 
-class AnswersResult(_Part):
+class AnswersResult(_ResultPart):
     """The two answers, side by side: never mix the pose of one with the arm of the other."""
 
     as_reported: AnswerResult
@@ -293,7 +295,7 @@ class AnswersResult(_Part):
     """Answer for the arm with its error corrected; null if no error was found."""
 
 
-class StageTiming(_Part):
+class StageTiming(_ResultPart):
     """Duration of one step, without the steps it pulls from."""
 
     seconds: float
@@ -302,7 +304,7 @@ class StageTiming(_Part):
     """Share of a live session in which the arm stood while nothing was exposed."""
 
 
-class WarningResult(_Part):
+class WarningResult(_ResultPart):
     """A warning, and what to do about it."""
 
     text: str
@@ -311,7 +313,7 @@ class WarningResult(_Part):
     """A command, a line of the recipe, or what to do at the cell."""
 
 
-class Provenance(_Part):
+class Provenance(_ResultPart):
     """Provenance of the result."""
 
     versions: dict[str, str]
@@ -326,7 +328,7 @@ class Provenance(_Part):
     """Notes of the source and the steps."""
 
 
-class Result(_Part):
+class Result(_ResultPart):
     """The content of ``result.json``."""
 
     format: int = 1
@@ -335,7 +337,9 @@ class Result(_Part):
     status: Literal["verified", "unverified", "refused", "incomplete"]
     """unverified: there was no verify step; incomplete: of a run that was killed."""
     refused: str | None = None
-    """Why."""
+    """What is wrong, and how it is known."""
+    advice: str = ""
+    """The next step after a refusal; empty where none is known."""
     method: str | None = None
     """The solve step."""
     transforms: dict[str, TransformResult]

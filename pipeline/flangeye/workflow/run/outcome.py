@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from flangeye import types as t
+from flangeye.errors import CalibrationRefused
 from flangeye.models.cell import cell_in
 from flangeye.models.workspace import work_of
 from flangeye.plugin.registry import Registry
@@ -41,7 +42,7 @@ class Outcome:
     calibration: t.HandEye | None = None
     verifications: dict[str, t.Verification] = field(default_factory=dict)
     rejections: list[t.Rejection] = field(default_factory=list)
-    refused: str | None = None
+    refused: CalibrationRefused | None = None
     seen: list[t.Observation] = field(default_factory=list)
     scan: t.WorkpieceScan | None = None
     seam: t.Seam | None = None
@@ -93,7 +94,8 @@ def result_of(
     result = r.Result(
         title=recipe.header.title,
         status=outcome.status,
-        refused=outcome.refused,
+        refused=outcome.refused.wrong if outcome.refused else None,
+        advice=outcome.refused.advice if outcome.refused else "",
         transforms=sections.transforms_result(calibration),
         correction=sections.correction_result(known),
         answers=sections.answers_result(calibration, holdout),

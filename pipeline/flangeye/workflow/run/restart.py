@@ -66,7 +66,7 @@ class FromNothing:
         return stream
 
     def does(self, step: Step) -> bool:
-        """Return whether a step is done, rather than read back."""
+        """Return whether a step is executed; otherwise its result is read from the log."""
         return True
 
     def given(self, step: Step) -> Any:
@@ -148,7 +148,7 @@ class FromLog(FromNothing):
         return t.Captures(readings, self._source, len(self.log.poses) - len(self.left_out))
 
     def does(self, step: Step) -> bool:
-        """Return whether a step is done, rather than read back."""
+        """Return whether a step is executed; otherwise its result is read from the log."""
         return self.at <= step.index
 
     def given(self, step: Step) -> Any:

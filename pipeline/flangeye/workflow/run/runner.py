@@ -83,7 +83,7 @@ class Runner:
             self._export()
             self._weld(truths)
         except CalibrationRefused as error:
-            self._outcome.refused = str(error)
+            self._outcome.refused = error
         result = result_of(self._outcome, self._recipe, self._registry, self._watch, truths)
         self._hooks.flangeye_run_finished(result=result.model_dump(mode="json"))
         return result
@@ -392,9 +392,10 @@ class Runner:
     def _verify(self) -> None:
         for step in self._steps("verify"):
             self._outcome.verifications[step.label] = self._call(step)
-        failed = [v.reason for v in self._outcome.verifications.values() if not v.passed]
+        failed = [v for v in self._outcome.verifications.values() if not v.passed]
         if failed:
-            raise CalibrationRefused("; ".join(failed))
+            advice = next((v.advice for v in failed if v.advice), "")
+            raise CalibrationRefused("; ".join(v.reason for v in failed), advice)
         calibration = self._outcome.calibration
         if self._outcome.verifications and calibration is not None:
             # Seam and weld stages take this type only: no torch moves by an unverified calibration
