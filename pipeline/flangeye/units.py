@@ -11,18 +11,18 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 
-_DEGREE, _MILLI = Decimal(math.pi) / 180, Decimal("1e-3")
+_DEG, _MILLI = Decimal(math.pi) / 180, Decimal("1e-3")
 _UNITS: dict[str, tuple[str, dict[str, Decimal]]] = {
     "length": ("31.5 mm", {"mm": _MILLI, "m": Decimal(1), "um": Decimal("1e-6")}),
-    "angle": ("17 deg", {"deg": _DEGREE, "rad": Decimal(1), "mrad": _MILLI}),
+    "angle": ("17 deg", {"deg": _DEG, "rad": Decimal(1), "mrad": _MILLI}),
     "joint position": (
         "170 deg",
-        {"deg": _DEGREE, "rad": Decimal(1), "mm": _MILLI, "m": Decimal(1)},
+        {"deg": _DEG, "rad": Decimal(1), "mm": _MILLI, "m": Decimal(1)},
     ),
     "duration": ("500 ms", {"ms": _MILLI, "s": Decimal(1), "min": Decimal(60)}),
     "speed": ("50 mm/s", {"mm/s": _MILLI, "m/s": Decimal(1)}),
     "acceleration": ("200 mm/s^2", {"mm/s^2": _MILLI, "m/s^2": Decimal(1)}),
-    "angular speed": ("30 deg/s", {"deg/s": _DEGREE, "rad/s": Decimal(1)}),
+    "angular speed": ("30 deg/s", {"deg/s": _DEG, "rad/s": Decimal(1)}),
     "force": ("3 N", {"N": Decimal(1), "mN": _MILLI}),
     "stiffness": ("2 N/mm", {"N/mm": Decimal("1e3"), "N/m": Decimal(1)}),
 }

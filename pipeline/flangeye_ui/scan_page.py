@@ -151,6 +151,7 @@ class RunPanel:
         if not view.captures and run.code is None:
             self._left.text = "Getting ready …"
         said = [*view.rows(), *view.events, run.code, run.outlook]
+        # Only what has changed is sent to the browser: this runs several times a second
         if said != self._said:
             self._said = said
             self._show_log()
@@ -257,6 +258,7 @@ class Control:
         ui.keyboard(on_key=self._key)
         ui.on("beat", self._beat)
         client.on_disconnect(lambda: project.page_gone(self._me))
+        # A browser tab that hangs keeps its connection: so it has to send a beat, twice a second
         ui.timer(
             0.1, lambda: ui.run_javascript("setInterval(() => emitEvent('beat'), 500)"), once=True
         )
@@ -276,6 +278,7 @@ class Control:
         if self.running or self._project.elsewhere():
             ui.notify("a run is under way; stop it first", type="warning")
             return
+        # The code stands in the terminal of the server, so only its user can let the arm move
         code = None
         if moves:
             self._project.codes.ask(words, self._me)

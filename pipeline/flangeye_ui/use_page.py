@@ -70,7 +70,7 @@ class Systems:
                 box = ui.input("Search your system", on_change=lambda e: self._search(e.value))
                 box.classes("w-full").props("outlined dense clearable autofocus")
                 box.on("keydown.enter", self._first)
-                self._none = ui.label("No system has these words.").props('role="status"')
+                self._none = ui.label("No name has these words.").props('role="status"')
                 listed = ui.list().props('bordered separator role="group" aria-label="Systems"')
                 with listed.classes("w-full systems"):
                     self._items = {name: self._item(name) for name in files}

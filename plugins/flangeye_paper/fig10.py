@@ -40,7 +40,7 @@ def fig10(batches: Path, out: Path) -> None:
 
 
 def _summary(rows: Sequence[Row], poses: int) -> dict[str, Any]:
-    """Return the emulation's errors as printed, and every method's at the work."""
+    """Return the simulated errors in the paper's measure, and each method's error at the work."""
     here = {r["method"]: r for r in rows if r["poses"] == poses}
     oracle = here["algorithm-1-oracle"]
     printed = {

@@ -67,7 +67,8 @@ def heldout(batches: Path, archive: Path, out: Path) -> None:
     found = {method: _by_recording(batches, method) for method in HELD_OUT_METHODS}
     rows: list[Row] = []
     for key, recording in RECORDINGS.items():
-        kept = _kept(found["robust"][key][0])
+        observations = found["robust"][key][0].result()["observations"]
+        kept = {o["id"] for o in observations if o["used"]}
         for method, look in HELD_OUT_METHODS.items():
             if key in found[method]:
                 rows.append(_row(recording, look.label, found[method][key], kept))
@@ -94,10 +95,6 @@ def _sessions(batches: Path, method: str) -> Iterable[SessionRow]:
     )
     for folder in folders or [batches / f"heldout_{method}"]:
         yield from (session for session in read_sessions(folder) if session.accepted)
-
-
-def _kept(session: SessionRow) -> set[str]:
-    return {o["id"] for o in session.result()["observations"] if o["used"]}
 
 
 def _row(recording: CentreSet, label: str, splits: list[SessionRow], kept: set[str]) -> Row:

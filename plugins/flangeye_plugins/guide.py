@@ -91,7 +91,7 @@ def _guided(
     model: RobotModel = recipe.context[RobotModel]
     limits = recipe.context[LimitsSection].for_robot(model)
     with ExitStack() as opened:
-        arm = _Arm(driver, model, limits, opened)
+        arm = _SharedArm(driver, model, limits, opened)
         with arm.standing() as robot:
             latest = LatestState(robot.state())
             sensor: TactileSensor = opened.enter_context(params.sensor(finger, latest, seed))
@@ -128,7 +128,7 @@ def _guided(
     return "\n".join([counts, *_summary_lines(found, measured), *points, use])
 
 
-class _Arm:
+class _SharedArm:
     """An arm that a person and the program move in turn.
 
     While the person moves it, it is only read: the guard would stop an arm that moves without a

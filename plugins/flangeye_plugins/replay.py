@@ -30,7 +30,7 @@ def replay_tactile(log: FilePath, step: str) -> ReplayedStep:
         elif again is not None:
             again.take(note)
     if again is None:
-        raise StageError(f"{log}: step {step} did not get so far as to decide anything")
+        raise StageError(f"{log}: step {step} logged no decision to repeat")
     return again.account()
 
 

@@ -23,7 +23,7 @@ CAMERA_MATRICES = (
     "cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "matrix", "k", "m",
 )  # fmt: skip
 """Names of the camera matrix. Like all names here they are in lower case, without separators."""
-_FIRST = ("", "1", "left", "l")
+_FIRST_CAMERA = ("", "1", "left", "l")
 """Suffixes of the names of the only camera, or of the first of a stereo pair."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """OpenCV's distortion coefficients in their order."""
@@ -177,7 +177,7 @@ def _plain(values: Mapping[Any, Any]) -> dict[str, Any]:
 
 def _matrix(values: Mapping[str, Any]) -> Floats | None:
     matrix = _one_by_one(values)
-    matrix = _named(values, _FIRST) if matrix is None else matrix
+    matrix = _named(values, _FIRST_CAMERA) if matrix is None else matrix
     if matrix is not None and "radialdistortion" in values:  # MATLAB's first pixel is at 1, 1
         matrix = matrix - [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
     return matrix
@@ -224,7 +224,7 @@ def _distortion(values: Mapping[str, Any]) -> Floats:
         "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distortion", "dist", "coeffs",
         "d",
     )  # fmt: skip
-    named = [f"{name}{which}" for name in usual for which in _FIRST]
+    named = [f"{name}{which}" for name in usual for which in _FIRST_CAMERA]
     for name in (*named, *others):
         value = values.get(name)
         if isinstance(value, Mapping):

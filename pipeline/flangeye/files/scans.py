@@ -272,7 +272,7 @@ def _together(
 ) -> tuple[list[list[Path]], list[str]]:
     """Merge the clouds of one folder with the images of another."""
     scans = [list(chain.from_iterable(each)) for each in zip(*(s for s, _ in found), strict=True)]
-    twice = next((paths for paths in scans if len(_kinds(paths)) < len(paths)), None)
+    twice = next((paths for paths in scans if len({*map(is_cloud, paths)}) < len(paths)), None)
     if twice is not None:
         named = " and ".join(str(path.relative_to(path.parent.parent)) for path in twice)
         raise StageError(
@@ -280,10 +280,6 @@ def _together(
             "column called scan, or remove one folder"
         )
     return scans, list(dict.fromkeys(note for _, notes in found for note in notes))
-
-
-def _kinds(scans: Sequence[Path]) -> set[bool]:
-    return {is_cloud(path) for path in scans}
 
 
 def is_cloud(path: Path) -> bool:

@@ -218,7 +218,7 @@ def _whole(data: Mapping[Any, Any]) -> str:
     return dumped(dict(data), width=100)
 
 
-class _Dumper(yaml.SafeDumper):
+class _PlainDumper(yaml.SafeDumper):
     """YAML writer that quotes texts which :func:`read_yaml` would read as numbers: 08, 1e3."""
 
     def represent_text(self, text: str) -> yaml.Node:
@@ -226,13 +226,13 @@ class _Dumper(yaml.SafeDumper):
         return self.represent_scalar("tag:yaml.org,2002:str", text, style)
 
 
-_Dumper.add_representer(str, _Dumper.represent_text)
+_PlainDumper.add_representer(str, _PlainDumper.represent_text)
 
 
 def dumped(value: Any, *, default_flow_style: bool | None = False, width: int = 80) -> str:
     """Return plain data as YAML that :func:`read_yaml` reads back as it was."""
     text: str = yaml.dump(
-        value, Dumper=_Dumper, default_flow_style=default_flow_style, width=width,
+        value, Dumper=_PlainDumper, default_flow_style=default_flow_style, width=width,
         sort_keys=False, allow_unicode=True,
     )  # fmt: skip
     return text

@@ -103,16 +103,16 @@ def robust_planes(
     if not groups:
         return []
     few = [points[:: 1 + len(points) // PLANE_POINTS] for points in groups]
-    rows, slabs = _Rows.of(few, rough), _Slabs.at(rough, gates)
+    rows, slabs = _Groups.of(few, rough), _Slabs.at(rough, gates)
     more = any(len(some) < len(points) for some, points in zip(few, groups, strict=True))
     _of_majority(rows, slabs, RESTLESS)
     _opened(rows, slabs, sigmas, RESTLESS if more else 0.0)
     if more:
-        _opened(_Rows.of(groups, rough), slabs, sigmas, 0.0)
+        _opened(_Groups.of(groups, rough), slabs, sigmas, 0.0)
     return slabs.planes(rough)
 
 
-class _Rows(NamedTuple):
+class _Groups(NamedTuple):
     """Groups of points side by side, the shorter ones filled up.
 
     Attributes:
@@ -125,7 +125,7 @@ class _Rows(NamedTuple):
     there: Mask
 
     @classmethod
-    def of(cls, groups: Sequence[Floats | Singles], rough: Sequence[Plane]) -> _Rows:
+    def of(cls, groups: Sequence[Floats | Singles], rough: Sequence[Plane]) -> _Groups:
         sizes = np.array([len(points) for points in groups])
         shape = (len(groups), 9, sizes.max(initial=1))
         moments = np.zeros(shape, dtype=np.result_type(np.float32, *groups))
@@ -135,9 +135,9 @@ class _Rows(NamedTuple):
             np.multiply(moments[:, i], moments[:, j], out=moments[:, row])
         return cls(moments, np.arange(shape[2]) < sizes[:, None])
 
-    def some(self, which: Mask) -> _Rows:
-        """Return the rows of the groups in a mask."""
-        return _Rows(self.moments[which], self.there[which])
+    def some(self, which: Mask) -> _Groups:
+        """Return the groups that a mask selects."""
+        return _Groups(self.moments[which], self.there[which])
 
 
 class _Slabs:
@@ -162,7 +162,7 @@ class _Slabs:
     def at(cls, rough: Sequence[Plane], gates: Floats) -> _Slabs:
         return cls(np.array([plane.normal for plane in rough]).reshape(-1, 3), gates)
 
-    def off(self, rows: _Rows, which: Indices) -> Floats:
+    def off(self, rows: _Groups, which: Indices) -> Floats:
         """Return (Q, K) the distances of points from some of the planes."""
         normals = self.normals[which]
         level = (normals * self.points[which]).sum(axis=1)
@@ -170,7 +170,7 @@ class _Slabs:
         heights -= level[:, None]
         return np.abs(heights, out=heights)
 
-    def fit(self, rows: _Rows, chosen: Mask, counts: Indices, which: Indices) -> None:
+    def fit(self, rows: _Groups, chosen: Mask, counts: Indices, which: Indices) -> None:
         """Refit planes to the (Q, K) chosen points, ``counts`` (Q,), by total least squares."""
         sums = (rows.moments @ chosen[..., None].astype(rows.moments.dtype))[..., 0]
         moments = sums / counts[:, None]
@@ -193,7 +193,7 @@ class _Slabs:
         ]
 
 
-def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
+def _of_majority(rows: _Groups, slabs: _Slabs, restless: float) -> None:
     """Refit each plane to the nearest half of the points in its slab until these stay the same.
 
     Concentration steps of least trimmed squares (Rousseeuw and Van Driessen 1999).
@@ -216,7 +216,7 @@ def _of_majority(rows: _Rows, slabs: _Slabs, restless: float) -> None:
         slabs.fit(rows, chosen, counts, going)
 
 
-def _opened(rows: _Rows, slabs: _Slabs, sigmas: float, restless: float) -> None:
+def _opened(rows: _Groups, slabs: _Slabs, sigmas: float, restless: float) -> None:
     """Refit each plane to all points in its slab, widened to their noise, until at rest."""
     going = np.flatnonzero(slabs.found)
     if len(going) < len(slabs.found):

@@ -223,7 +223,7 @@ class Cell:
         return Arm(self.arms[link.arm]).pose(joints, link.number)
 
     def with_links(self, links: Sequence[Link]) -> Cell:
-        """Return the cell with frames of some links."""
+        """Return the cell with a moving frame added for each of some links."""
         frames = {link.frame: Frame(f"{link.arm}_base") for link in links}
         return replace(
             self,

@@ -57,7 +57,7 @@ class Urdf:
             joints.append(self.above[link])
             link = end_of(joints[-1], "parent")
             if len(joints) > len(self.links):
-                raise RecipeError(f"{self.path}: its joints go round in a circle at '{link}'")
+                raise RecipeError(f"{self.path}: its joints form a closed loop at link '{link}'")
         return joints[::-1]
 
     def moved(self) -> list[str]:

@@ -80,6 +80,7 @@ class PluginTable(MutableMapping[str, Kind]):
             found = getattr(importlib.import_module(module), attribute)
         except Exception as error:  # a vendor's import may fail in any way
             failed = f"'{name}' cannot be imported from {place} ({type(error).__name__}: {error})"
+            # An import that fails for lack of memory is not the plugin's fault: that ends the run
             require_memory(failed)
             raise PluginNotFoundError(failed) from error
         plugins: tuple[object, ...] = found if isinstance(found, tuple) else (found,)
@@ -199,6 +200,7 @@ class Registry:
     def register(self, owner: str, plugin: object) -> None:
         """Add one plugin module and all it offers."""
         self.hooks.register(plugin, name=owner)
+        # A misspelt hook would never be called; pluggy names it only if asked
         self.hooks.check_pending()
         hooks = self.hooks.hook
         for hook, places in (
@@ -270,6 +272,7 @@ def _load(registry: Registry, entry_point: EntryPoint) -> None:
 
 
 def _builtin_first(entry_point: EntryPoint) -> tuple[bool, str]:
+    # The built-in names are taken first: a vendor's that repeats one is the duplicate
     return (entry_point.name != "builtin", entry_point.name)
 
 

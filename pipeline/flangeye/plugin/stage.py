@@ -37,6 +37,7 @@ class Params(Described):
     model_config = ConfigDict(
         frozen=True,
         extra="forbid",
+        # Defaults are written as text with a unit, such as 0.3 mm, so they are validated too
         validate_default=True,
         arbitrary_types_allowed=True,
         # Listing stages imports every plugin; only the models that are used need be built.
@@ -345,6 +346,7 @@ class Choose:
         return {"anyOf": [{"enum": list(self.words)}, part]} if self.words else part
 
     def _choose(self, value: Any, info: ValidationInfo) -> BoundPart | str:
+        # A part that code has chosen, or that an earlier validation has made of its name
         if isinstance(value, BoundPart) or (isinstance(value, str) and value in self.words):
             return value
         if isinstance(value, str):
@@ -457,6 +459,7 @@ AnyPlugin = TypeVar("AnyPlugin", bound=Plugin)
 
 
 def _read_signature(cls: type[AnyPlugin], name: str, function: Callable[..., Any]) -> AnyPlugin:
+    # Annotations are text until now: one that cannot be resolved fails at import, not in a run
     hints = get_type_hints(function)
     params = hints.pop("params", None)
     gives = _alternatives(hints.pop("return", type(None)))

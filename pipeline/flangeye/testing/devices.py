@@ -94,7 +94,7 @@ class DriverConformance(Conformance):
         else:
             raise AssertionError("a device that is not there could be opened")
         took = time.monotonic() - began
-        require(took < PATIENCE + LATE, f"it took {took:.1f} s to say so, at most {PATIENCE:g} s")
+        require(took < PATIENCE + LATE, f"the error came after {took:.1f} s, limit {PATIENCE:g} s")
 
     def _models(self) -> dict[str, Any]:
         values = {**self._cell(), **self.context()}

@@ -195,7 +195,7 @@ def _unseen(plan: Plan, site: Site, rng: np.random.Generator) -> list[Floats]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Session:
+class _Visits:
     """A session that visits every pose once.
 
     The scanner's buffers, 300 MB, live while captures are read. The arrays of joints (N, n),
@@ -298,11 +298,11 @@ def _session(
     unseen: Sequence[Floats],
     params: SimulatedParams,
     errors: np.random.SeedSequence,
-) -> _Session:
+) -> _Visits:
     of_arm, of_scanner = errors.spawn(2)
     arm = ImperfectArm(cell.robot, float(params.arm.quality != "exact"), _rng(of_arm), params.arm)
     joints = np.array([*(pose.joints for pose in stops.all), *unseen])
-    return _Session(cell, scanner, stops, params, arm, joints, arm.angles(joints), of_scanner)
+    return _Visits(cell, scanner, stops, params, arm, joints, arm.angles(joints), of_scanner)
 
 
 def _rng(sequence: np.random.SeedSequence) -> np.random.Generator:

@@ -109,7 +109,7 @@ def acquire_simulated_images(
         near, far = eye.scanner.near, eye.scanner.far
     view = CameraView(params.distance, near, far, _field(camera), MOST_OBLIQUE)
     moments = plan_session(robot, second, configuration, (params, view), rng)
-    studio = _CellScene(BOARDS[params.board], camera, eye)
+    studio = _BoardScene(BOARDS[params.board], camera, eye)
     covers = _covers(params, rng)
 
     def captures() -> Iterator[Capture]:
@@ -152,7 +152,7 @@ def _covers(params: SimulatedImagesParams, rng: np.random.Generator) -> list[Cov
 
 
 @dataclass(frozen=True, eq=False)
-class _CellScene:
+class _BoardScene:
     """Camera and target, ready to render images."""
 
     board: Board

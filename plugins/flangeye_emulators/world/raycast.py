@@ -89,7 +89,7 @@ def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
     )
 
 
-class _Crossings(NamedTuple):
+class _Met(NamedTuple):
     """Intersections of an array of rays (...).
 
     Attributes:
@@ -165,11 +165,11 @@ class RaycastScene:
         slants.ravel()[between] = _dot(exact.normals, x, y, 1)
         return Hits(depth, body, slants, met.normals, between, exact.normals)
 
-    def _cast(self, rays: Any) -> _Crossings:
+    def _cast(self, rays: Any) -> _Met:
         found = self._scene.cast_rays(rays, nthreads=1)
         body = np.minimum(found["geometry_ids"].numpy(), len(self.materials)).astype(np.uint8)
         normals = np.moveaxis(found["primitive_normals"].numpy(), -1, 0)
-        return _Crossings(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
+        return _Met(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
 
     def hidden(self, light: Floats, pixels: Pixels, depth: Image, wanted: Mask) -> Mask:
         """Return the mask (H, W) of pixels whose points are in shadow; exact where ``wanted``.
@@ -262,7 +262,7 @@ def _beams(light: Floats, pixels: Pixels, depth: Image, at: Indices) -> Any:
     return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
 
 
-def _is_flat(met: _Crossings, away: Image) -> Mask:
+def _is_flat(met: _Met, away: Image) -> Mask:
     """Return the mask of samples that lie with their eight neighbours in one plane of one body.
 
     Args:
@@ -283,7 +283,7 @@ def _is_flat(met: _Crossings, away: Image) -> Mask:
 
 
 def _spread(samples: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an image in which each sample is repeated for its square of pixels."""
+    """Return an image in which each sample fills its 2 x 2 pixels."""
     out = np.empty(shape, dtype=samples.dtype)
     for r, c in SQUARES:
         part = out[r::2, c::2]
@@ -292,7 +292,7 @@ def _spread(samples: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _any_of_square(marked: Mask) -> NDArray[np.uint8]:
-    """Return the mask of samples with a marked pixel in their square."""
+    """Return the mask of samples that have a marked pixel among their 2 x 2 pixels."""
     out = marked[::2, ::2].astype(np.uint8)
     for r, c in SQUARES[1:]:
         part = marked[r::2, c::2]
@@ -301,7 +301,7 @@ def _any_of_square(marked: Mask) -> NDArray[np.uint8]:
 
 
 def _between(marked: Mask, shape: tuple[int, ...]) -> Indices:
-    """Return the flat indices of the pixels in marked samples' squares, without the samples."""
+    """Return the flat indices of the three other pixels in the 2 x 2 pixels of marked samples."""
     at = np.flatnonzero(marked)
     row = at // marked.shape[1]
     column = at - row * marked.shape[1]

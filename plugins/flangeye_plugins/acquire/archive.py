@@ -85,6 +85,7 @@ def acquire_archive(
     recorded = open_archive(path, params)
     usable, notes = _usable(recorded, params.unreadable)
     check_usable(recorded.root, usable, cell, fewest=params.fewest)
+    # Equal clouds at two poses are a mistake of pairing, which no later residual would name
     digests = digests_of(r.cloud for r in usable if r.cloud)
     check_distinct_clouds(usable, digests)
     scanner = scanner or ScannerData(model="the scanner")
@@ -118,7 +119,7 @@ def _usable(archive: Archive, unreadable: str) -> tuple[list[Recording], list[st
             # What is set aside must be known now, so then the inside is looked at too.
             if unreadable == "reject":
                 read_scan(cloud)
-            elif not is_remote(cloud):
+            elif not is_remote(cloud):  # a header alone; a remote file would have to be fetched
                 check_scan(cloud)
         except StageError as error:
             if unreadable == "refuse":
@@ -159,6 +160,7 @@ def _first_distance(
     """Return the first cloud with a finite point, and its median distance in the file's unit."""
     for _, path in _clouds(usable):
         told.clear()
+        # As if in metres: the number itself is compared with the scanner's range in each unit
         raw = median_distance(read_scan(path, "m", told.append, from_viewpoint))
         if math.isfinite(raw):
             return path, raw

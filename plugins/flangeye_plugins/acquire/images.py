@@ -47,7 +47,7 @@ TOO_ALIKE = (
     "they are too alike; tilt the board by 20 deg and more to both sides, or write focal_length: "
     "[fx, fy] and principal_point: [cx, cy]"
 )
-FIRST = 8
+SAMPLED_VIEWS = 8
 """Images that are looked at first: a set that shows the board in half of its images passes."""
 
 Grey = NDArray[np.uint8]
@@ -156,11 +156,12 @@ def lens_of(images: Mapping[str, Grey], board: Board, start: Image | None = None
     looked = _looked(images, board)
     seen = {name: found for name, found in looked.items() if isinstance(found, Corners)}
     _require_views(len(seen), looked)
+    # Before the fit, which converges for parallel boards too, to any focal length
     _require_tilted(seen)
     lens = camera_of(seen, size, start)
-    kept = {
-        n: c for (n, c), e in zip(seen.items(), lens[1], strict=True) if not _outlies(e, lens[1])
-    }
+    # Views with a larger reprojection error take no part
+    limit = 4.0 * float(np.median(lens[1]))
+    kept = {n: c for (n, c), e in zip(seen.items(), lens[1], strict=True) if e <= limit}
     if len(kept) < len(seen):
         _require_views(len(kept), looked)
         lens = camera_of(kept, size, start)
@@ -177,7 +178,7 @@ def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rej
         NothingSeen: None of a first sample, spread over all images, shows the board.
     """
     views = {name: Image(pixels, np.eye(3)) for name, pixels in images.items()}
-    if len(views) <= FIRST:
+    if len(views) <= SAMPLED_VIEWS:
         return {name: find_corners(board, view) for name, view in views.items()}
     first = _spread_over(list(views))
     early = {name: find_corners(board, views[name], thorough=False) for name in first}
@@ -190,7 +191,7 @@ def _looked(images: Mapping[str, Grey], board: Board) -> dict[str, Corners | Rej
 
 
 def _spread_over(names: Sequence[str]) -> list[str]:
-    return [names[i] for i in np.linspace(0, len(names) - 1, FIRST).astype(int)]
+    return [names[i] for i in np.linspace(0, len(names) - 1, SAMPLED_VIEWS).astype(int)]
 
 
 def _not_shown(
@@ -247,11 +248,6 @@ def _require_views(seen: int, looked: Mapping[str, Corners | Rejected]) -> None:
         )
 
 
-def _outlies(error: float, errors: Floats) -> bool:
-    # Times the median reprojection error beyond which a view takes no part
-    return error > 4.0 * float(np.median(errors))
-
-
 def camera_of(
     seen: Mapping[str, Corners], size: tuple[int, ...], start: Image | None
 ) -> tuple[CalibratedLens, Floats]:
@@ -260,6 +256,8 @@ def camera_of(
 
     points = [corners.points.astype(np.float32) for corners in seen.values()]
     pixels = [corners.pixels.astype(np.float32) for corners in seen.values()]
+    # k3 matters at the rim of wide lenses only, where boards on an arm have no corners: it would
+    # fit noise
     flags = cv2.CALIB_FIX_K3 | (cv2.CALIB_USE_INTRINSIC_GUESS if start else 0)
     matrix = np.eye(3) if start is None else np.array(start.camera_matrix)
     lens = np.zeros(5) if start is None else np.resize(np.append(start.distortion, np.zeros(5)), 5)
@@ -271,6 +269,7 @@ def camera_of(
     squares = (errors**2 * counts).sum()
     # OpenCV's errors are of points, ours of a coordinate.
     total = float(np.sqrt(squares / counts.sum() / 2))
+    # Two coordinates a corner, less six numbers a pose and eight of the camera
     freedom = max(2 * counts.sum() - 6 * len(points) - 8, 1)
     views = zip(points, turns, moves, strict=True)
     found = CalibratedLens(
@@ -289,6 +288,7 @@ def _spread(views: Iterable[tuple[Any, Any, Any]], matrix: Any, lens: Any) -> Fl
     for points, turn, move in views:
         jacobian = np.asarray(cv2.projectPoints(points, turn, move, matrix, lens)[1])
         pose, camera = jacobian[:, :6], jacobian[:, 6:14]
+        # What the view's free pose can explain says nothing about the camera (Schur complement)
         told = camera - pose @ np.linalg.lstsq(pose, camera, rcond=None)[0]
         information += told.T @ told
     return np.asarray(np.linalg.inv(information))
@@ -378,7 +378,7 @@ def acquire_images(
         raise StageError(f"{recorded.root}: holds no images ({recorded.layout})")
     check_poses(recorded.root, usable, whole=True, fewest=params.fewest)
     cameras, told = _cameras(recorded.root, usable, params)
-    if board is not None and params.board is None and len(usable) > FIRST:
+    if board is not None and params.board is None and len(usable) > SAMPLED_VIEWS:
         _require_shown(usable, cameras, board)
     files = [path for r in usable for path in (r.image, r.cloud) if path is not None]
     skipped = skipped_note(recorded, lambda r: r.image is not None, "image")

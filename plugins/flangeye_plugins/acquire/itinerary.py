@@ -63,6 +63,7 @@ class Itinerary:
         Raises:
             StageError: No stop for verification is possible.
         """
+        # Two random streams, so that the number of stops for verification leaves the plan unchanged
         planning, checking = np.random.SeedSequence(seed).spawn(2)
         self._plan = poses(self._site, np.random.default_rng(planning))
         rng = np.random.default_rng(checking)
@@ -127,7 +128,7 @@ class Itinerary:
         for stop in stops:
             way = None if here is None else self.way(here, stop)
             rows.append(self._row(stop, way))
-            if not isinstance(way, NoRoute):
+            if not isinstance(way, NoRoute):  # an unreachable stop is skipped, not waited for
                 here = stop.pose.joints
         head = (
             f"{len(stops)} stops, {seconds_of(rows):.0f} s of motion; {self._plan.wanted} were "

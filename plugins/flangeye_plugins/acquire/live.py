@@ -158,6 +158,7 @@ def acquire_live(  # noqa: PLR0913  what it asks the runner for
             require_inside(guard.state, allowed)
         opened = opening.enter_context(eye.open())
         itinerary = planned(guard.state.joints)
+        # The devices stay open after this function: the captures close them
         release = opening.pop_all()
     done = resumed.done if resumed else frozenset()
     session = LiveSession(itinerary, guard, opened, params.moved, done, stage_log, arm.passive)
@@ -282,6 +283,7 @@ class LiveSession:
             self.stage_log("next", {"id": stop.id, "why": stop.pose.why})
             self.idle.leaves(time.monotonic_ns())
             self.arm.go(way)
+            # While the arm moves, the last scan is transferred and the caller fits it
             if taken:
                 yield taken()
             taken = self._expose(stop, self.arm.wait().time_ns)
@@ -311,6 +313,7 @@ class LiveSession:
     def _stands_since(self, arrived_ns: int) -> int:
         """Return the time since which the arm has been at rest, at most 10 s ago [ns]."""
         samples = self.arm.during(arrived_ns - 10_000_000_000, arrived_ns)
+        # Backwards from the arrival, with half the allowed motion left for the exposure itself
         away = np.flatnonzero(movements(samples[::-1]) > 0.5 * self.moved)
         return samples[len(samples) - away[0] if len(away) else 0].time_ns
 
@@ -334,12 +337,14 @@ class LiveSession:
                 f"the flange moved {moved * 1e3:.2f} mm during the exposure, "
                 f"allowed {self.moved * 1e3:.2f} mm",
             )
+        # The pose at mid-exposure: a slow drift during the exposure then cancels to first order
         middle = during[len(during) // 2]
         return Capture(
             id=stop.id,
             cloud=scan.cloud,
             poses=by_frame(Transform(BASE, FLANGE, middle.base_T_flange)),
             joints=middle.joints,
+            # Exposures are timed by the monotonic clock, captures by the date
             time_ns=time.time_ns() - (time.monotonic_ns() - scan.ended_ns),
             role=stop.role,
             image=scan.image,
@@ -365,6 +370,7 @@ def movements(samples: Sequence[RememberedState]) -> Floats:
     """Return the distances (N,) of a point 0.1 m off the flange's centre from its start [m]."""
     poses = np.array([sample.base_T_flange for sample in samples])
     moves = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)
+    # |R - I| in the Frobenius norm is sqrt(8) sin(angle / 2), so sqrt(2) times a small angle
     turns = np.linalg.norm(poses[:, :3, :3] - poses[0, :3, :3], axis=(1, 2)) / np.sqrt(2)
     return np.asarray(moves + 0.1 * turns)
 

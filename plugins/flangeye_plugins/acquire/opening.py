@@ -52,7 +52,7 @@ class OpeningParams(Params):
     """Common parameters: the archive and its layout."""
 
     path: RecipePath | None = None
-    """The archive; --archive on the command line comes before it."""
+    """The archive; --archive on the command line replaces it."""
     reader: Annotated[BoundPart, Choose("reader")] = param("auto")
     """Layout of the archive; auto detects and reports it."""
     leave_out: tuple[str, ...] = ()

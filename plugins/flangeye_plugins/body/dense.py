@@ -34,7 +34,7 @@ completely unknown rotation has 1.8, but the linearisation does not reach that f
 """
 
 
-class _Equations(NamedTuple):
+class _Linearised(NamedTuple):
     """Linearised residuals of the fit.
 
     The 14 columns are rotation [rad], translation [sizes of the body], lost width by direction of
@@ -158,7 +158,7 @@ class _Settled(NamedTuple):
     """Converged state of the fit."""
 
     pose: Floats
-    left: _Equations
+    left: _Linearised
     weights: Floats
     information: Floats
     surface: int
@@ -278,7 +278,7 @@ def _bread(rest: _Settled) -> Floats:
 
 def _surface(
     points: Floats, shape: Shape, pose: Floats, reach: float, rounding: Floats, rounded: float
-) -> _Equations:
+) -> _Linearised:
     """Return the equations of scan points whose rays meet the body.
 
     A residual is the distance along the ray, projected on the surface normal, corrected for the
@@ -332,7 +332,7 @@ def _ends(
     pose: Floats,
     lost: Floats,
     reach: float,
-) -> _Equations:
+) -> _Linearised:
     """Return the equations of the scan's edges, matched to the visible ends of the body's faces.
 
     Offsets are measured perpendicular to the ray, because the scanner loses a fixed number of
@@ -401,7 +401,7 @@ def _equations(
     pose: Floats,
     shape: Shape,
     errors: Floats,
-) -> _Equations:
+) -> _Linearised:
     """Return the equations of residuals at points ``place`` (N, 3) along ``along`` (N, 3).
 
     ``errors`` (N, 7) are the derivatives by lost widths and rounding.
@@ -411,23 +411,23 @@ def _equations(
     normals = along @ rotation.T
     swells = np.einsum("ni,ni->n", arms, normals)
     jacobian = np.column_stack([np.cross(arms, normals), shape.size * normals, errors, swells])
-    return _Equations(jacobian, residual, place, along)
+    return _Linearised(jacobian, residual, place, along)
 
 
 def _weighted(
-    surface: _Equations, ends: _Equations, noise: float, spread: float
-) -> tuple[_Equations, Floats]:
+    surface: _Linearised, ends: _Linearised, noise: float, spread: float
+) -> tuple[_Linearised, Floats]:
     """Return all equations, and their Geman-McClure weights over their variances."""
     parts = []
     for part, sigma in ((surface, noise), (ends, spread)):
         # This scale is 94 % efficient for normal noise; the influence of outliers goes to zero
         scale = 3.6 * sigma
         parts.append(1 / (sigma**2 * (1 + (part.residual / scale) ** 2) ** 2))
-    joined = _Equations(*(np.concatenate(both) for both in zip(surface, ends, strict=True)))
+    joined = _Linearised(*(np.concatenate(both) for both in zip(surface, ends, strict=True)))
     return joined, np.concatenate(parts)
 
 
-def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: int) -> Floats:
+def _noise(equations: _Linearised, weights: Floats, cluster: Indices, surface: int) -> Floats:
     """Return the (14, 14) covariance of the scores from noise that is correlated within patches.
 
     The covariance for independent points is scaled by one inflation factor for surfaces and one for
@@ -445,7 +445,7 @@ def _noise(equations: _Equations, weights: Floats, cluster: Indices, surface: in
     return out
 
 
-def _patches(equations: _Equations, shape: Shape) -> Indices:
+def _patches(equations: _Linearised, shape: Shape) -> Indices:
     # Points of one cell (an eighth of the size) and facing form a patch
     place = np.floor(equations.place / (shape.size / 8)).astype(np.int64)
     keys = np.column_stack([place, _sextants(equations.facing)])
@@ -453,7 +453,7 @@ def _patches(equations: _Equations, shape: Shape) -> Indices:
 
 
 def _pulls(
-    equations: _Equations, weights: Floats, cluster: Indices, pose: Floats
+    equations: _Linearised, weights: Floats, cluster: Indices, pose: Floats
 ) -> tuple[Floats, Floats]:
     """Return the patches' centres (P, 3) and their effect on the scores (P, 14, 3)."""
     many = np.bincount(cluster)

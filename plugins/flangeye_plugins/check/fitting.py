@@ -301,7 +301,7 @@ HELPS = 0.7
 
 
 MISFIT_SHARE = 0.2
-"""And at most this share of how far the samples are apart."""
+"""Largest error held out that a correction may leave, as a share of the samples' spread."""
 
 
 class Significance(NamedTuple):

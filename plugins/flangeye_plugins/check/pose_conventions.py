@@ -38,7 +38,7 @@ from flangeye_plugins.check.fitting import (
     pairs_of,
 )
 
-_WAYS: Mapping[str, tuple[Change, str]] = {
+_FLIPPED: Mapping[str, tuple[Change, str]] = {
     "inverted": (
         inverted,
         "poses are flange_T_base (or the camera is carried the other way round)",
@@ -197,7 +197,7 @@ def direction(session: RecordedSession) -> Findings:
     corrected_session, whose, way = tried[evidence.which]
     if evidence.probability == 1 or not helps(session, corrected_session):
         return
-    name, what = "pose direction", f"{whose} {_WAYS[way][1]}"
+    name, what = "pose direction", f"{whose} {_FLIPPED[way][1]}"
     fix = corrected_session.step()
     if way == "inverted" and _may_be_mounted_otherwise(session):
         readings = [_after_inverting(each) for each in _likely_readings(corrected_session)]
@@ -308,7 +308,7 @@ def _distances(session: RecordedSession) -> tuple[float, float]:
 def _turned_round(session: RecordedSession) -> Iterator[tuple[RecordedSession, str, str]]:
     for arms in session.arms:
         whose = "the" if session.seconds is None else arm_possessive(arms, session)
-        for way, (change, _) in _WAYS.items():
+        for way, (change, _) in _FLIPPED.items():
             yield session.corrected(change, arms, robot={way: True}), whose, way
 
 

@@ -35,7 +35,7 @@ METRES: Mapping[str, float] = {
     "m": 1.0, "mm": 1e-3, "cm": 1e-2, "inches": 25.4e-3, "feet": 0.3048, "um": 1e-6,
 }  # fmt: skip
 """Units of lengths."""
-ARMS = (0.1, 4.0)
+ARM_DISTANCES = (0.1, 4.0)
 """Median distance of a flange from its base [m], from the smallest arm to the largest."""
 
 
@@ -142,10 +142,10 @@ def _rather_target(session: RecordedSession, said: str, meant: str) -> bool:
     if session.links is not None:
         return False
     factor = METRES[meant] / METRES[said]
-    arm = _outside(_distance_of_arm(session) * factor, ARMS) + _outside(
+    arm = _outside(_distance_of_arm(session) * factor, ARM_DISTANCES) + _outside(
         _distance_of_target(session), session.reach
     )
-    target = _outside(_distance_of_arm(session), ARMS) + _outside(
+    target = _outside(_distance_of_arm(session), ARM_DISTANCES) + _outside(
         _distance_of_target(session) / factor, session.reach
     )
     return target < arm
@@ -165,7 +165,7 @@ def _too_far(session: RecordedSession) -> Finding | None:
     It needs no calibration, so it works when there are other mistakes as well.
     """
     arm, target = _distance_of_arm(session), _distance_of_target(session)
-    lengths = {"robot": (arm, ARMS), "target": (target, session.reach)}
+    lengths = {"robot": (arm, ARM_DISTANCES), "target": (target, session.reach)}
     if not session.uses_poses or session.seconds is not None:
         del lengths["robot"]
     told: dict[str, Any] = {}

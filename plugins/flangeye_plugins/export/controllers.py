@@ -70,6 +70,7 @@ class ControllerFormat:
         words = {
             "name": require_identifier(params.name, self.reserved),
             "number": getattr(params, "number", None),
+            # A camera beside the robot is a fixed frame there, one on the arm is a tool
             "sort": self.sort[0 if pose.stands else 1],
             "remarks": pose.comment(self.mark),
         }
@@ -206,6 +207,7 @@ def export_robot(
             "export.robot: no error of the arm's joints was found; add refine.arm, or see in its "
             "notes why it left them out"
         )
+    # Only what differs from the defaults: the file is read and edited by people
     document = with_correction(robot, correction).model_dump(mode="json", exclude_defaults=True)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
     comment = f"{pose.comment('#')}# The arm corrected, not as its controller has it.\n"

@@ -125,17 +125,17 @@ class _Matrix(dict[str, Any]):
     """A matrix of OpenCV's FileStorage."""
 
 
-class _Dumper(yaml.SafeDumper):
+class _OpenCvDumper(yaml.SafeDumper):
     """PyYAML's safe writer, with OpenCV's tag."""
 
 
-_Dumper.add_representer(
+_OpenCvDumper.add_representer(
     _Matrix, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:opencv-matrix", data)
 )
 
 
 def _yaml(document: Mapping[str, Any]) -> str:
-    text: str = yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=None)
+    text: str = yaml.dump(document, Dumper=_OpenCvDumper, sort_keys=False, default_flow_style=None)
     return text
 
 

@@ -87,7 +87,7 @@ def read_franka(folder: Path) -> Archive:
 
 
 def _in_millimetres(folder: Path, poses_file: Path, poses: Poses) -> Archive:
-    """Return poses with the clouds and centres of the same numbers."""
+    """Return the archive of poses with the clouds and centres of their numbers, in millimetres."""
     clouds = _clouds(folder)
     _refuse_unpaired(clouds, poses, poses_file)
     recordings = _with_centres(folder, poses, clouds, MM)
@@ -145,7 +145,7 @@ def _sample_recording(where: str, key: str, entry: Any, cloud: Path) -> Recordin
     except (KeyError, TypeError, ValueError) as error:
         raise StageError(f"{where}: robot_pose or p_cam is missing or wrong ({error})") from None
     if pose.shape != (7,) or centre.shape not in ((0,), (3,)):
-        raise StageError(f"{where}: robot_pose has {pose.size} numbers (7), p_cam {centre.size}")
+        raise StageError(f"{where}: robot_pose has {pose.size} numbers, not 7; p_cam {centre.size}")
     # The sample's quaternions are w x y z, those of the other recordings x y z w
     w, *xyz = pose[3:]
     matrix = pose_from_quaternion(where, pose[:3], [*xyz, w])
@@ -258,7 +258,7 @@ Robot = Literal["aubo", "ur5", "ur10e", "franka", "kinect", "sample-2019"]
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Location:
     """Location of a recording in the repository, and the file by which it is recognised."""
 
     folder: PurePosixPath
@@ -266,13 +266,13 @@ class _Place:
     read: Callable[[Path], Archive]
 
 
-_DATASETS: Mapping[str, _Place] = {
-    "aubo": _Place(PurePosixPath("data/aubo"), "data.txt", read_aubo),
-    "ur5": _Place(PurePosixPath("data/ur5"), f"{_POSE_FILE}.npz", read_ur),
-    "ur10e": _Place(PurePosixPath("data/ur10e"), f"{_POSE_FILE}.npz", read_ur),
-    "franka": _Place(PurePosixPath("data/franka"), f"{_POSE_FILE}.npy", read_franka),
-    "kinect": _Place(PurePosixPath("Kinect_Result"), "readRobot.txt", read_kinect),
-    "sample-2019": _Place(
+_DATASETS: Mapping[str, _Location] = {
+    "aubo": _Location(PurePosixPath("data/aubo"), "data.txt", read_aubo),
+    "ur5": _Location(PurePosixPath("data/ur5"), f"{_POSE_FILE}.npz", read_ur),
+    "ur10e": _Location(PurePosixPath("data/ur10e"), f"{_POSE_FILE}.npz", read_ur),
+    "franka": _Location(PurePosixPath("data/franka"), f"{_POSE_FILE}.npy", read_franka),
+    "kinect": _Location(PurePosixPath("Kinect_Result"), "readRobot.txt", read_kinect),
+    "sample-2019": _Location(
         PurePosixPath("calib_toolbox/data/2019-06-14-sample"), "calib_data.json", read_sample_2019
     ),
 }

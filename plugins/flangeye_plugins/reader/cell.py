@@ -193,7 +193,7 @@ def _arms(folder: Path, params: CellParams) -> Iterator[PoseTable]:
         text = table_with_rows(folder, given.file)
         found = readings_of(text, given, [*_taken(given), *given.joints])
         for row, value in enumerate(found.values):
-            if value is None:
+            if value is None:  # a controller always knows its pose, unlike a camera
                 raise StageError(f"{text.where(row)}: has no pose of '{name}'")
         poses = np.array(found.values)
         poses = poses if given.pose == "base_T_flange" else inverted(poses)
@@ -256,6 +256,7 @@ def _keys(text: Table, number: Column | None, times: Floats | None) -> dict[str,
 
 
 def _require_one_join(seen: CameraTable, moved: Sequence[PoseTable]) -> None:
+    # A number and a time cannot be compared, so one table joined otherwise would join with none
     for each in moved:
         if (each.times is None) != (seen.times is None):
             files = (seen.text.file, each.text.file)
@@ -303,6 +304,7 @@ def _by_time(
         pairs, notes = pair(arm, events, _signals(arm, events, values), params)
     except StageError as error:
         raise StageError(f"{seen.text.file}: {error}") from None
+    # The mean of a standstill's measurements holds only if nothing else of the cell moved meanwhile
     still = [p for p in pairs if all(_stands(each, p, events) for each in moved)]
     if len(still) < len(pairs):
         notes.append(f"left out {len(pairs) - len(still)} poses, at which something else moved")
@@ -364,6 +366,7 @@ def _stands(each: PoseTable, found: MatchedPose, events: Floats) -> bool:
     before, after = (_at(each, found.time + side) for side in (-half, half))
     if each.values.ndim == 1:
         return bool(abs(after - before) < STILL_DISTANCE)
+    # trace(R) = 1 + 2 cos(angle); rounding may lead beyond -1 or 1
     turned = np.arccos(np.clip((np.trace(before[:3, :3].T @ after[:3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm(after[:3, 3] - before[:3, 3])
     return bool(moved < STILL_DISTANCE and turned < STILL_ANGLE)

@@ -66,6 +66,8 @@ class PoseMistake(Params):
 
     def undone(self, poses: Floats) -> Floats:
         """Return corrected poses (N, 4, 4)."""
+        # In the order in which numbers become poses: axes and rotation first, the inverse of the
+        # whole pose after them, so that its position is in the right frame when it is scaled
         if self.axes:
             poses = rigid(optical(self.axes), np.zeros(3)) @ poses
         if self.rotation:
@@ -110,6 +112,7 @@ def corrected(path: Path, params: CorrectedParams) -> Archive:
     if params.shift:
         recordings = _shift(archive, recordings, params)
     if params.backwards:
+        # Poses for verification were recorded apart, so they are in no such order
         count = sum(recording.role == "calibration" for recording in recordings)
         every = np.ones(count, dtype=bool)
         recordings = _replaced(recordings, lambda rows: rows[::-1], every, params.arms)

@@ -84,6 +84,7 @@ def pair(
             f"from {moved[0]:.3f} to {moved[-1]:.3f} s: they have no time in common; set "
             "clock_offset"
         )
+    # At rest a wrong clock offset does no harm, so standstills are preferred to interpolation
     pairs = _standing(arm, spans, moved)
     if len(pairs) >= MIN_CAPTURES:
         return pairs, [f"the arm stood still {len(pairs)} times with measurements; {told}"]
@@ -99,6 +100,8 @@ def _offset(
 ) -> tuple[float, str]:
     if params.clock_offset is not None:
         return params.clock_offset, f"clock offset {_ms(params.clock_offset)} as given"
+    # Both angular speeds have the same course, whatever the frames: their correlation peaks at the
+    # offset. Below some twenty samples chance makes peaks too
     if signals is not None and min(len(times) for times, _ in signals) > 20:
         offset, alike = clock_offset(*signals)
         if alike > 0:
@@ -139,6 +142,7 @@ def _passing(arm: tuple[Floats, Floats], moved: Floats, params: PairingParams) -
         return []
     before = np.clip(np.searchsorted(times, moved[usable]) - 1, 0, len(times) - 1)
     after = np.clip(before + 1, 0, len(times) - 1)
+    # Between samples so far apart the arm's path is unknown: the nearer sample is taken as it is
     sparse = times[after] - times[before] > 2 * params.tolerance
     at = np.where(sparse, times[_nearest(times, moved[usable])], moved[usable])
     between = interpolated(times, poses, at) if len(times) > 1 else poses[[0] * len(at)]

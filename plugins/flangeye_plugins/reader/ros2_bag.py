@@ -203,6 +203,7 @@ def _arm(
         bag, params.flange,
         ("flange", "tool0", "tool_flange", "panda_link8", "fr3_link8", "lbr_link_ee", "link_eef"),
     )  # fmt: skip
+    # tf before PoseStamped: its frames have names, a pose alone may be that of a tool
     if base and flange:
         told = f"the flange's poses from tf, {base} to {flange}"
         return bag.frames.between(base, flange), told, joints
@@ -263,6 +264,7 @@ def _joints(bag: Bag, params: BagParams) -> Stream | None:
     if len(topics) != 1:
         return None
     times, values = bag.joints[str(topics[0])]
+    # Drivers sort joints by name, and other devices share the topic: the order is by the names
     names = params.joints or joints_in_order(values[0])
     usable = [(t, v) for t, v in zip(times, values, strict=True) if set(names) <= set(v)]
     if not names or not usable:
@@ -333,7 +335,7 @@ class Scans:
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / 3.0:
             return None
         looks = self._sound(self.first, range(len(self.times)), lambda _, message: _look(message))
-        if len({look.shape for look in looks.values()}) != 1:
+        if len({look.shape for look in looks.values()}) != 1:  # clouds of changing size
             return None
         changes = [float(np.abs(b - a).mean()) for a, b in pairwise(looks.values())]
         times = self.times[list(looks)]
@@ -376,6 +378,7 @@ class Scans:
 
     def _middle(self, events: Sequence[int]) -> int:
         """Return the middle one of a standstill's undamaged messages."""
+        # Farthest from the motions before and after, whose vibration fades during a standstill
         damaged = self.damaged.get(self.first, {})
         sound = [event for event in events if event not in damaged] or events
         return sound[len(sound) // 2]

@@ -174,6 +174,7 @@ def _columns(text: Table, params: TableParams, scan: int | None) -> list[int]:
     others = [o for o in (params.target, params.second) if o and o.file is None]
     taken = {at for other in others for at in text.indices(other.columns)}
     times = [o.time for o in (params, *others) if o.time is not None]
+    # What is left over is the pose: its number of columns is checked against the convention
     taken |= {text.index(time) for time in times} | set(text.indices(params.joints))
     taken |= {scan} if scan is not None else set()
     return [i for i in range(len(text.rows[0][1])) if i not in taken]
@@ -234,6 +235,7 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
 
 def _named(folder: Path, name: str) -> Path | None:
     """Return the scan with a name, in the folder or in exactly one of its subfolders."""
+    # Two subfolders with the same name, as of two cameras, would be a guess: then neither is taken
     inner = sorted(folder.glob(f"*/{escape(name)}")) if name and Path(name).name == name else []
     if name and (folder / name).is_file():
         return folder / name

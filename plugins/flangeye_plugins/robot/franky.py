@@ -167,6 +167,7 @@ class FrankyRobot(Device):
         """
         self.name, self._sdk, self._robot = name, sdk, connection
         self._stopping: Any = None
+        # Reentrant: a stop is commanded while a new motion holds the lock
         self._looked, self._commands = time.monotonic(), threading.RLock()
         self.offset = np.array(self._ask(lambda: connection.state.F_T_EE).matrix)
         self.flange_T_tool: Transform | None = Transform(FLANGE, TOOL, self.offset)
@@ -264,7 +265,7 @@ class FrankyRobot(Device):
             with self._commands, contextlib.suppress(DeviceError):
                 if not self._closed and time.monotonic() - self._looked > SILENT:
                     self.stop()
-                    self._looked = math.inf
+                    self._looked = math.inf  # not again until the state is read
 
     def _start(self, motion: Any, stopping: Any) -> None:
         state = self.state()

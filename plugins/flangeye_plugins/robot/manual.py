@@ -224,7 +224,7 @@ class ManualRobot(Device):
             self._desk.say(f"{why or 'no joint angles reach that pose'}; once more")
         elif why:
             self._faulted = pose, joints
-            self._desk.say(f"{why} (once more, or yes if it stands there)")
+            self._desk.say(f"{why} (type the pose again, or yes if the arm stands there)")
         else:
             self._arrive(pose, joints)
 
@@ -347,7 +347,7 @@ def _tool(pose: Floats, asked: Floats, tolerance: Tolerance) -> str | None:
     # How far from the flange's axis a tool's tip is looked for [m]
     along_axis = np.hypot(in_flange[0], in_flange[1]) < 0.02 and in_flange[2] > 0
     if off.angle <= tolerance.angle and along_axis:
-        return f"is a tool of {in_flange[2] * 1e3:.0f} mm set; the flange's pose is asked for"
+        return f"is this the pose of a tool, {in_flange[2] * 1e3:.0f} mm beyond the flange"
     return None
 
 

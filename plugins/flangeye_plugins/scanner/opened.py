@@ -116,7 +116,7 @@ def require_in_range(name: str, cloud: PointCloud, model: ScannerModel | None) -
         return
     distance = median_distance(cloud)
     if times_outside(distance, model) > STATED_LIMIT:
-        cure = "is the scanner's model right, and does it give the unit that it states?"
+        cure = "check the recipe's scanner model, and the unit in which the driver gives points"
         if times_outside(distance / 1e3, model) <= DETECTED_LIMIT:
             cure = "these look like millimetres: let its driver give metres"
         raise DeviceError(

@@ -1,6 +1,5 @@
 """``scanner.watched_folder``: reads the clouds that the scanner's own software exports."""
 
-import re
 import sys
 import threading
 import time
@@ -12,6 +11,7 @@ from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.errors import StageError
 from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
 from flangeye.files.paths import RecipePath
+from flangeye.files.scans import natural
 from flangeye.models.scanners import ScannerModel, check_unit, median_distance
 from flangeye.plugin.stage import Params, part
 from flangeye.types import PointCloud
@@ -133,7 +133,7 @@ class WatchedFolder(OpenScanner):
         there = self._look()
         self._arrivals = {path: a for path, a in self._arrivals.items() if path in there}
         new = [path for path, stamp in there.items() if self._known.get(path) != stamp]
-        for path in sorted(new, key=_counted):
+        for path in sorted(new, key=lambda path: natural(path.name)):
             before = self._arrivals.get(path)
             if before is None:
                 # The exposure may have begun right after the last look without the file
@@ -167,8 +167,3 @@ class WatchedFolder(OpenScanner):
 
 def _is_cloud(path: Path) -> bool:
     return path.suffix.lower() in CLOUD_FILES and not path.name.startswith((".", "~"))
-
-
-def _counted(path: Path) -> list[str]:
-    """Return a sort key that puts scan_9 before scan_10."""
-    return [part.zfill(20) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

@@ -150,7 +150,7 @@ def follow(cell: WeldCell, controller: Controller, weld_log: WeldLog, longest: f
             seconds = state.time_ns * 1e-9
             began = seconds if began is None else began
             if seconds - began > longest:
-                return f"it did not come to its end within {longest:.0f} s"
+                return f"the end of the seam was not reached within {longest:.0f} s"
             _turn(cell, controller, weld_log, state, clock)
     except DeviceError as error:
         return str(error)

@@ -76,13 +76,13 @@ class SeamPlace(NamedTuple):
     place: Place
 
     def rolled(self, vectors: Floats) -> Floats:
-        """Convert a vector (3,) in base to the plane."""
+        """Convert a vector (3,) in base to the axes of the rolled-out plane."""
         along, left, up = (vectors @ self.axes).tolist()
         tx, ty = self.place.tangent.tolist()
         return np.array([along * tx - left * ty, along * ty + left * tx, up])
 
     def unrolled(self, vector: Floats) -> Floats:
-        """Convert a vector (3,) in the plane to base."""
+        """Convert a vector (3,) in the axes of the rolled-out plane to base."""
         x, y, z = vector.tolist()
         tx, ty = self.place.tangent.tolist()
         return np.asarray(self.axes @ np.array([x * tx + y * ty, y * tx - x * ty, z]))

@@ -324,7 +324,7 @@ def test_a_spoilt_entry(repository: Path) -> None:
         f"{file}: '1': robot_pose or p_cam is missing or wrong ('robot_pose')"
     )
     file.write_text(json.dumps(whole | {"1": {"p_cam": [1, 2, 3], "robot_pose": [1, 2]}}))
-    assert refused(folder) == f"{file}: '1': robot_pose has 2 numbers (7), p_cam 3"
+    assert refused(folder) == f"{file}: '1': robot_pose has 2 numbers, not 7; p_cam 3"
 
 
 # --- the recordings themselves -----------------------------------------------------------------

@@ -106,7 +106,8 @@ def test_a_strange_pose_is_asked_about_and_kept_when_it_is_meant(person: Person)
     person.types(CONVENTIONS["kuka"].text(AT_HOME.matrix))
     assert robot.state().mode == "moving"
     assert person.last() == (
-        "that is 100.0 mm and 0.0 deg from the pose asked for (once more, or yes if it stands there)"
+        "that is 100.0 mm and 0.0 deg from the pose asked for (type the pose again, or yes "
+        "if the arm stands there)"
     )
     person.types("yes")
     state = robot.state()
@@ -226,8 +227,8 @@ def test_another_makers_convention_is_named(meant: str, typed: str, said: str) -
 def test_a_tool_is_named() -> None:
     tip = rigid(TILTED[:3, :3], TILTED[:3, 3] + 0.15 * TILTED[:3, 2])
     assert doubted(CONVENTIONS["fanuc"].numbers(tip), "fanuc") == (
-        "that is 150.0 mm and 0.0 deg from the pose asked for: is a tool of 150 mm set; the "
-        "flange's pose is asked for?"
+        "that is 150.0 mm and 0.0 deg from the pose asked for: is this the pose of a tool, "
+        "150 mm beyond the flange?"
     )
 
 

@@ -160,7 +160,7 @@ def test_a_weld_that_takes_longer_than_it_may_ends_by_the_arm_s_clock_and_the_ar
 ):
     desk = Desk()
     reason, cycles = followed(desk, Ending(99), longest=1.05)
-    assert reason == "it did not come to its end within 1 s"
+    assert reason == "the end of the seam was not reached within 1 s"
     assert len(cycles) == 11 and desk.told[-1] == "stop"  # a tenth of a second each
 
 

@@ -122,11 +122,11 @@ first, second, arm = "first_marker.csv", "second_marker.csv", "arm.csv"
 FAULTS = {
     "inverted marker": (
         rewritten(first, WHOLE, inverse),
-        "what first saw of marker are poses target_T_camera, not the other way round",
+        "what first saw of marker are poses target_T_camera, not camera_T_target",
     ),
     "both inverted": (
         both(rewritten(first, WHOLE, inverse), rewritten(second, WHOLE, inverse)),
-        "what all cameras saw are poses target_T_camera, not the other way round",
+        "what all cameras saw are poses target_T_camera, not camera_T_target",
     ),
     "marker in mm": (
         rewritten(first, PLACE, lambda p: 1e3 * p),
@@ -152,7 +152,7 @@ FAULTS = {
     ),
     "stated inverse": (
         in_recipe("file: second_marker.csv", r"\g<0>\n          pose: target_T_camera"),
-        "what second saw of marker are poses camera_T_target, not the other way round",
+        "what second saw of marker are poses camera_T_target, not target_T_camera",
     ),
     "stands elsewhere": (
         in_recipe("second: base", "second: rail"),

@@ -60,7 +60,7 @@ def _beyond(value: float, others: Points, times: float) -> bool:
 
 
 def _not_among(depth: float, others: Points) -> bool:
-    """Return whether all others are ahead of the scanner, and the depth is its own or behind it."""
+    """Return whether a depth is zero or behind the scanner, while all others are before it."""
     ahead = np.sign(others[:1])
     return bool(others.size) and bool((others * ahead > 0).all() and depth * ahead <= 0)
 

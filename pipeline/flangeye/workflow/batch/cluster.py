@@ -284,7 +284,7 @@ class ChunkPacer:
         return self._client.cluster is None and sessions < share * 256
 
     def cut(self, sessions: Iterable[tuple[int, BatchSession]]) -> Iterator[Chunk]:
-        """Yield chunks on demand, each of the size that is then right."""
+        """Yield chunks on demand; the size of each follows from the session times so far."""
         for block, members in groupby(sessions, key=lambda each: each[0] // FILE_SESSIONS):
             while some := [session for _, session in islice(members, self.size())]:
                 self._left -= len(some)

@@ -230,6 +230,7 @@ class BatchPlan:
         names = [_session_name(self.recipe.stem, archive) for archive in self.archives]
         for variant in self.variants:
             for seed in variant.seeds:
+                # Archives change fastest, so that neighbours share a recipe that a worker has read
                 for archive, name in zip(self.archives, names, strict=True):
                     key = session_key(variant.common, seed, archive, self._prints)
                     yield BatchSession(
@@ -296,6 +297,7 @@ def _variant(path: Path, registry: Registry, overrides: Sequence[str]) -> Recipe
 
 
 def _session_name(recipe: str, archive: str | None) -> str:
+    # The name of a folder on any file system and in any object store
     name = f"{recipe}_{PurePath(archive).name}" if archive else recipe
     return re.sub(r"[^A-Za-z0-9._=-]+", "-", name)[:80].lstrip(".-")
 

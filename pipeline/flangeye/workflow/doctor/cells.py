@@ -262,7 +262,7 @@ def _read_otherwise(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspic
         parent, child = str(pose).split("_T_")
         name = "inverted marker" if "camera" in (parent, child) else "inverted pose"
         inverse = f"{child}_T_{parent}"
-        what = f"{whose} are poses {inverse}, not the other way round"
+        what = f"{whose} are poses {inverse}, not {pose}"
         yield Suspicion(name, what, {(*keys, "pose"): inverse for keys in tables})
     length = _common(tables, "length")
     for unit in LENGTHS:

@@ -94,6 +94,7 @@ def _offer(
     keys: Sequence[Hashable],
     make: Callable[[], Any],
 ) -> None:
+    # There, but without a value: a step that needs it is not reported as well
     context[offered] = None
     try:
         context[offered] = make()
@@ -258,6 +259,7 @@ def _check_limits(limits: LimitsSection, robot: RobotModel, complain: Complain) 
             f"at most {np.degrees(robot.joint_speed):.4g} deg/s for a {robot.model}, "
             f"not {np.degrees(limits.joint_speed):.4g} deg/s",
         )
+    # The nearest point of the box to the base decides whether any of it can be reached
     low = np.asarray(limits.box.centre) - np.asarray(limits.box.size) / 2
     high = low + np.asarray(limits.box.size)
     nearest, most = float(np.linalg.norm(np.clip(0.0, low, high))), 4 * robot.length

@@ -45,6 +45,7 @@ def apply_override(data: dict[Hashable, Any], override: str) -> Keys:
 def _put(data: Any, keys: Keys, value: Any, path: str) -> None:
     node = data
     for key in keys[:-1]:
+        # An override may open a section that the recipe leaves out
         if isinstance(node, dict) and node.get(key) is None:
             node[key] = {}
         node = node[key]
@@ -64,6 +65,7 @@ def _step(data: dict[Hashable, Any], path: str) -> tuple[int | None, str]:
         if place not in map(str, range(len(names))):
             numbers = f"steps are 0 to {len(names) - 1}"
             raise RecipeError(f"--set {path}: no step '{place}'; {numbers}")
+        # The stage's name after its index says the same again: it is no parameter
         return int(place), f"{below}.".removeprefix(f"{names[int(place)]}.").removesuffix(".")
     meant = [i for i, name in enumerate(names) if name and f"{path}.".startswith(f"{name}.")]
     if len(meant) > 1:

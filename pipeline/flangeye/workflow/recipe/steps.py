@@ -156,6 +156,7 @@ class StepOrder:
         if stage and kind in ("solve", "refine", "verify"):
             self._check_configuration(at, stage)
         gives = stage.gives if stage and kind == "acquire" else ()
+        # A source of ready-made observations has no captures to segment or to fit
         opened = (t.Observations,) if gives == (t.Observations,) else KINDS[kind].opens
         self._have |= set(opened)
         self._kinds.append(kind)
@@ -170,6 +171,7 @@ class StepOrder:
         self._lost = True
 
     def _need(self, at: tuple[Hashable, ...], need: Any, purpose: str) -> None:
+        # After an entry that is no step anything may have been given, except what the header gives
         known = need in self._have or (self._lost and need not in SECTIONS)
         if not known:
             self._complain(at, _missing(need, purpose))
@@ -210,6 +212,7 @@ class StepOrder:
         elif rank < self._rank:
             later = list(KINDS)[self._rank]
             self._complain(at, f"{_a(kind)} step cannot come after {_a(later)} step")
+        # The latest so far: a step out of place is reported once, not every step after it
         self._rank = max(self._rank, rank)
 
 

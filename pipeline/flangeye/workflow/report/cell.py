@@ -127,7 +127,7 @@ def _from_each(facts: Facts, poses: Floats, words: str) -> PlotlyFigure:
 
 
 def _rows(names: list[str]) -> dict[str, list[int]]:
-    """Return the rows of each name."""
+    """Return the indices at which each name occurs."""
     return {name: [i for i, each in enumerate(names) if each == name] for name in names}
 
 

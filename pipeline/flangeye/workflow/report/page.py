@@ -172,7 +172,7 @@ def _drawn(facts: Facts, judged: dict[str, str]) -> Iterator[CheckDrawing]:
 
 
 def _figure(note: JournalEntry) -> Figure:
-    """Return points by series over a value, as a step noted them."""
+    """Return a scatter plot of the series of points that a verify step logged."""
     value: dict[str, Any] = note.value
     series = value["series"].items()
     colours = [SERIES[name] for name in ("x", "y", "z", "used", "held_out")]

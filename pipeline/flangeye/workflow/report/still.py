@@ -100,7 +100,7 @@ def still(scene: StillScene, label: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class _Line:
+class _Polyline:
     """A line through (N, 3) points [m]."""
 
     points: Floats
@@ -122,7 +122,7 @@ def _flat(points: Floats) -> Floats:
     return np.asarray(np.atleast_2d(points) @ np.stack([right, -up], axis=1))
 
 
-def _floor(corners: Floats) -> Iterable[_Line]:
+def _floor(corners: Floats) -> Iterable[_Polyline]:
     """Return the squares of the floor below everything, and the axes of the base."""
     # Edge of a square of the floor [m].
     square = 0.25
@@ -133,11 +133,11 @@ def _floor(corners: Floats) -> Iterable[_Line]:
         for n in range(low[axis], high[axis] + 1):
             ends = np.zeros((2, 3))
             ends[:, axis], ends[:, 1 - axis] = n, (low[1 - axis], high[1 - axis])
-            lines.append(_Line(square * ends, "var(--grid, #9aa4b4)", 1.0, LINE_IN_PIXELS))
+            lines.append(_Polyline(square * ends, "var(--grid, #9aa4b4)", 1.0, LINE_IN_PIXELS))
     for axis, colour in enumerate((SERIES["x"], SERIES["y"], SERIES["z"])):
         tip = np.zeros((2, 3))
         tip[1, axis] = square
-        lines.append(_Line(tip, colour, 0.012))
+        lines.append(_Polyline(tip, colour, 0.012))
     return lines
 
 
@@ -157,7 +157,7 @@ def rods(robot: RobotModel, joints: Floats) -> list[tuple[float, Floats]]:
     return [*found, (plate, flange[:3, 3] - np.outer([0.03, plate], flange[:3, 2]))]
 
 
-def _arm(scene: StillScene) -> list[_Line]:
+def _arm(scene: StillScene) -> list[_Polyline]:
     """Return the arm's capsules, the far ones first, each with an edge."""
     if scene.robot is None:
         return []
@@ -167,25 +167,25 @@ def _arm(scene: StillScene) -> list[_Line]:
     edge, fill = "var(--axis, #5b6474)", "var(--arm, #b9c1cd)"
     lines = []
     for radius, ends in placed:
-        lines.append(_Line(ends, edge, 2 * radius))
+        lines.append(_Polyline(ends, edge, 2 * radius))
         # Width of the dark edge round the arm [m]
-        lines.append(_Line(ends, fill, 2 * radius - 0.012))
+        lines.append(_Polyline(ends, fill, 2 * radius - 0.012))
     flange = Arm(scene.robot).flange(joints)
     return [
         *lines,
-        _Line(flange[:3, 3] + np.outer([0.0, 0.1], flange[:3, 2]), SERIES["circle"], 0.01),
+        _Polyline(flange[:3, 3] + np.outer([0.0, 0.1], flange[:3, 2]), SERIES["circle"], 0.01),
     ]
 
 
-def _seen(scene: StillScene) -> list[_Line]:
+def _seen(scene: StillScene) -> list[_Polyline]:
     """Return lines of the scanner and of its field of view."""
     if scene.scanner is None:
         return []
     at = np.eye(4) if scene.base_T_camera is None else scene.base_T_camera
     near, far = frustum(scene.scanner, at)
     rays = [np.stack([at[:3, 3], corner]) for corner in far[:4]]
-    edges = [_Line(line, SERIES["used"], 1.5, LINE_IN_PIXELS) for line in (near, far, *rays)]
-    return [*edges, _Line(np.stack([at[:3, 3]] * 2), SERIES["used"], 9.0, LINE_IN_PIXELS)]
+    edges = [_Polyline(line, SERIES["used"], 1.5, LINE_IN_PIXELS) for line in (near, far, *rays)]
+    return [*edges, _Polyline(np.stack([at[:3, 3]] * 2), SERIES["used"], 9.0, LINE_IN_PIXELS)]
 
 
 def frustum(scanner: ScannerModel, base_T_camera: Floats) -> tuple[Floats, Floats]:
@@ -200,7 +200,7 @@ def frustum(scanner: ScannerModel, base_T_camera: Floats) -> tuple[Floats, Float
     return near, far
 
 
-def _kept(scene: StillScene) -> list[_Line]:
+def _kept(scene: StillScene) -> list[_Polyline]:
     """Return the edges of the box that the arm keeps to."""
     if scene.box is None:
         return []
@@ -209,9 +209,9 @@ def _kept(scene: StillScene) -> list[_Line]:
     rims = [np.column_stack([np.array(signs), np.full(5, z)]) * size / 2 + centre for z in (-1, 1)]
     posts = [np.stack(pair) for pair in zip(*(rim[:4] for rim in rims), strict=True)]
     dashed = f'{LINE_IN_PIXELS} stroke-dasharray="4 4"'
-    return [_Line(line, "var(--unverified, #d98a00)", 1.0, dashed) for line in [*rims, *posts]]
+    return [_Polyline(line, "var(--unverified, #d98a00)", 1.0, dashed) for line in [*rims, *posts]]
 
 
-def _poses(scene: StillScene) -> list[_Line]:
+def _poses(scene: StillScene) -> list[_Polyline]:
     good, bad = "var(--verified, #1a7f45)", "var(--refused, #c02626)"
-    return [_Line(np.stack([at, at]), good if taken else bad, 0.03) for at, taken in scene.poses]
+    return [_Polyline(np.stack([at, at]), good if used else bad, 0.03) for at, used in scene.poses]

@@ -20,7 +20,6 @@ from flangeye.plugin.registry import Registry
 from flangeye.types import Observation, PoseFeature, Transform
 from flangeye.types.geometry import quaternion_from_rotation, rotation_log
 from flangeye.workflow.log.read import RunLog
-from flangeye.workflow.recipe.load import Recipe
 from flangeye.workflow.result import SIMULATED
 from flangeye.workflow.run.folder import recipe_of_log
 
@@ -66,7 +65,9 @@ def write_tables(log: RunLog, folder: Path, registry: Registry) -> list[Path]:
     if log.source is not None and log.source.simulated:
         write_whole(folder / OF_A_SIMULATOR, f"{SIMULATED}.\n")
     files.append(folder / "recipe.yaml")
-    write_whole(files[-1], _recipe(_text(log, recipe), cell, seen, scans))
+    # As it was written, unless it names models that only the log carries
+    text = recipe.text if log.models else log.text("recipe.yaml") or recipe.text
+    write_whole(files[-1], _recipe(text, cell, seen, scans))
     return files
 
 
@@ -140,11 +141,6 @@ def _csv(rows: Iterator[Sequence[Any]]) -> str:
         # Twelve digits: a picometre at a metre
         writer.writerow([x if isinstance(x, str) else f"{x:.12g}" for x in row])
     return text.getvalue()
-
-
-def _text(log: RunLog, recipe: Recipe) -> str:
-    """Return the recipe as it was written, unless it names models that the log carries."""
-    return recipe.text if log.models else log.text("recipe.yaml") or recipe.text
 
 
 def _recipe(text: str, cell: Cell, seen: Sequence[Observation], scans: Mapping[str, str]) -> str:

@@ -95,18 +95,18 @@ def _integer_output(index: int) -> Output:
     return Output("INT32", lambda box: (box.registers.output_int[index],))
 
 
-_STILL = Output("VECTOR6D", _nothing(6))
+_ZEROS = Output("VECTOR6D", _nothing(6))
 
 OUTPUTS: dict[str, Output] = {
     "timestamp": Output("DOUBLE", lambda box: (box.time,)),
-    "target_qdd": _STILL,
-    "target_current": _STILL,
-    "target_moment": _STILL,
+    "target_qdd": _ZEROS,
+    "target_current": _ZEROS,
+    "target_moment": _ZEROS,
     "actual_q": Output("VECTOR6D", lambda box: box.arm.stance.joints.tolist()),
     "actual_qd": Output("VECTOR6D", lambda box: box.arm.speeds.tolist()),
-    "actual_current": _STILL,
-    "actual_current_as_torque": _STILL,
-    "joint_control_output": _STILL,
+    "actual_current": _ZEROS,
+    "actual_current_as_torque": _ZEROS,
+    "joint_control_output": _ZEROS,
     "actual_TCP_pose": Output("VECTOR6D", lambda box: box.tcp_pose().tolist()),
     "actual_TCP_speed": Output("VECTOR6D", lambda box: box.arm.twist.tolist()),
     "actual_TCP_force": Output("VECTOR6D", lambda box: box.arm.felt.tolist()),
@@ -137,7 +137,7 @@ OUTPUTS: dict[str, Output] = {
     "safety_status_bits": Output("UINT32", lambda box: (box.safety.status_bits,)),
     "payload": Output("DOUBLE", _nothing(1)),
     "payload_cog": Output("VECTOR3D", _nothing(3)),
-    "payload_inertia": _STILL,
+    "payload_inertia": _ZEROS,
     "output_bit_registers0_to_31": Output("UINT32", lambda box: (0,)),
     "output_bit_registers32_to_63": Output("UINT32", lambda box: (0,)),
     **{f"output_int_register_{i}": _integer_output(i) for i in range(Registers.COUNT)},
@@ -349,7 +349,8 @@ class InputRecipe:
             place = 0
             for type_ in self.types:
                 self._places.append(place)
-                place += len(struct.unpack(f">{RTDE_TYPES[type_]}", bytes(_size(type_))))
+                layout = struct.Struct(f">{RTDE_TYPES[type_]}")
+                place += len(layout.unpack(bytes(layout.size)))
 
     def apply(self, body: bytes, box: URController) -> None:
         """Apply a data package; one that is too short is dropped.
@@ -359,7 +360,3 @@ class InputRecipe:
         if len(body) >= self._packing.size:
             values = self._packing.unpack_from(body)
             write_inputs(box, dict(zip(self.names, (values[i] for i in self._places), strict=True)))
-
-
-def _size(type_: str) -> int:
-    return struct.calcsize(f">{RTDE_TYPES[type_]}")

@@ -64,12 +64,8 @@ def _stop(box: URController) -> None:
     box.stop_program("stopped at the dashboard")
 
 
-def _version(box: URController) -> str:
-    return f"URSoftware {'.'.join(map(str, box.box.version))} (loopback)"
-
-
 DASHBOARD: dict[str, Answer] = {
-    "polyscopeversion": _version,
+    "polyscopeversion": lambda box: f"URSoftware {'.'.join(map(str, box.box.version))} (loopback)",
     "get serial number": lambda box: "20245500001",
     "get robot model": lambda box: box.robot.model.rstrip("e").upper(),
     "is in remote control": lambda box: str(box.remote_control).lower(),

@@ -165,6 +165,7 @@ class AuboRobot(Device):
             base_T_flange=Transform(BASE, FLANGE, base_T_flange),
             joints=joints,
             joint_speeds=speeds,
+            # The pose was asked for about half way
             time_ns=(began + ended) // 2,
             mode=mode,
             force=wrench_at_flange(force, base_T_flange, base_T_tool),
@@ -214,6 +215,7 @@ class AuboRobot(Device):
 
     def wait_cycle(self) -> None:
         """Wait for one controller cycle; the controller sends no events of its own."""
+        # To the next multiple of the period: sleeping for a whole one would drift
         time.sleep(self.period - time.monotonic() % self.period)
 
     def stop(self) -> None:
@@ -303,6 +305,7 @@ class AuboRobot(Device):
             self._begins = -np.inf
             return True
         now = time.monotonic()
+        # Between a command and its execution the controller reports neither: the time decides then
         waits = self._ask("queue", motion.getQueueSize) > 0
         return bool(waits or now < self._begins or now < self._velocity_until)
 

@@ -22,7 +22,7 @@ RENEWAL = 0.025
 """Interval between two pieces of a motion [s]."""
 
 BEGINNING = pieces.BEHIND + 2 * RENEWAL
-"""How long before now a piece begins [s]."""
+"""Time before the present at which a new piece of trajectory begins [s]."""
 
 
 class Ros2RobotParams(ListenParams):

@@ -271,7 +271,7 @@ def only(mode: Mode) -> Floats:
 
 
 def _mostly(off: float, variance: float, seldom: float) -> float:
-    """Return a normal density with a share ``seldom`` of outliers of scale LIFTS."""
+    """Return the density of a normal mixture: a share ``seldom`` is wider by the scale LIFTS."""
     wide = _normal(off, variance + LIFTS**2)
     return (1.0 - seldom) * _normal(off, variance) + seldom * wide
 

@@ -310,7 +310,7 @@ class Follower:
         return ""
 
     def _aside(self, pose: ToolPose) -> float:
-        """Return the arm's offset towards the centre of the plan's curve, in radii."""
+        """Return the arm's offset towards the plan's centre of curvature, over the radius."""
         place = self.progress.place
         off = float((pose.position[:2] - place.point) @ place.normal)
         return off * self.task.plan.bend(self.tip)

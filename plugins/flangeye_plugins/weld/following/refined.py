@@ -198,7 +198,7 @@ class RefinedPath:
         self._cross[:, window] -= share[:, :, None] * cross[:, None, :]
 
     def _weigh(self, off: Floats, spread: Floats) -> None:
-        """Update the filters' weights by their innovations (M,), and the innovations' excess."""
+        """Update each filter's weight by its innovation (M,), and the scale of its noise."""
         # Forgetting factor of 1 % per measurement: the seam may become wavier further on.
         unlikely, kept = off**2 / spread, 0.99
         self._excess = np.maximum(kept * self._excess + (1 - kept) * unlikely, 1e-3)

@@ -112,12 +112,8 @@ def _row_names(table: Table, other: Table | None) -> Column | None:
     column = rests[0].index
     if rests[0].scan is not None or column is None or len({rest.index for rest in rests}) > 1:
         return rests[0].scan
-    counted = (_counts(each.numbers([each.index(column)])[:, 0]) for each in tables)
+    counted = ((np.diff(each.numbers([each.index(column)])[:, 0]) == 1).all() for each in tables)
     return None if all(counted) else column
-
-
-def _counts(numbers: Floats) -> bool:
-    return bool((np.diff(numbers) == 1).all())
 
 
 def _of_joints(arm: PoseColumns, questions: Questions, robot: RobotModel | None) -> dict[str, Any]:

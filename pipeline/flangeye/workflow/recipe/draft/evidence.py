@@ -153,7 +153,7 @@ def _of_seven(table: Table, part: list[int], numbers: Floats, told: str) -> Pose
 
 def _quaternion_at(numbers: Floats) -> int | None:
     """Return the index in seven columns at which a quaternion begins; None without one."""
-    for first in (3, 0):
+    for first in (3, 0):  # behind the position, as most write it, or before it
         norms = np.linalg.norm(numbers[:, first : first + 4], axis=1)
         if np.nanmax(np.abs(norms - 1)) < ROUNDED:
             return first
@@ -328,9 +328,10 @@ def _apart(one: Floats, other: Floats) -> float:
 def _turned(poses: Floats) -> Floats:
     """Return the angles [rad] between poses one and two apart."""
     turns = poses[:, :3, :3]
+    # Also two apart: neighbours may differ by a shift alone, whose angle decides nothing
     pairs = [np.swapaxes(turns[:-k], 1, 2) @ turns[k:] for k in (1, 2)]
     traces = np.trace(np.concatenate(pairs), axis1=1, axis2=2)
-    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1, 1)))  # trace(R) = 1 + 2 cos(angle)
 
 
 def _tilted(normals: Floats) -> Floats:
@@ -417,6 +418,7 @@ def _residual_of_centres(arm: Floats, seen: Floats, in_hand: bool) -> float:
 
     In the hand, P (X c + t) = s for all; beside the robot, X c + t = P s, linear in X, t and s.
     """
+    # X is not forced to be a rotation: so the fit is linear, and the wrong mounting fails even so
     many = len(arm)
     mapped = np.einsum("ij,nk->nijk", np.eye(3), np.c_[seen, np.ones(many)]).reshape(many, 3, 12)
     turned, standing = arm[:, :3, :3], np.tile(np.eye(3), (many, 1, 1))
@@ -424,6 +426,7 @@ def _residual_of_centres(arm: Floats, seen: Floats, in_hand: bool) -> float:
     rows = np.concatenate(sides, axis=2).reshape(-1, 15)
     wanted = (arm[:, :3, 3] * (-1.0 if in_hand else 1.0)).reshape(-1)
     found, *_ = np.linalg.lstsq(rows, wanted)
+    # The sum over coordinates, times three: the rms of a distance
     free = max(len(wanted) - 15, 1)
     return float(np.sqrt(((rows @ found - wanted) ** 2).sum() / free * 3))
 

@@ -18,7 +18,7 @@ JOINTS_ONLY = ("joints",)
 _POSITION_WORDS = (
     "position", "pos", "translation", "trans", "tvec", "location", "origin", "t", "p", "xyz",
 )  # fmt: skip
-_TURNS: Mapping[str, str] = {
+_TURN_WORDS: Mapping[str, str] = {
     "orientation": "q", "ori": "q", "quaternion": "q", "quat": "q", "q": "q",
     "rotation": "r", "rot": "r", "r": "r", "euler": "r", "angle": "r", "winkel": "r", "theta": "r",
     "rvec": "v", "rotvec": "v", "rodrigues": "v", "rpy": "e",
@@ -40,7 +40,7 @@ SEEN = re.compile(
 )
 """Words in column names of camera measurements."""
 
-_ARM = re.compile(
+_ARM_WORDS = re.compile(
     r"robot|arm|joint|gripper|flange|(?<!eye.in.)hand(?!.?eye)|tool|tcp|effector|"
     r"(?<![a-z])(?:ee|rob)(?![a-z])"
 )
@@ -256,7 +256,7 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
 
 
 def _is_index(table: Table, index: int, words: Sequence[str]) -> bool:
-    """Return whether a column is called as one that numbers rows or scans, and does so."""
+    """Return whether a column numbers the rows or scans, by its name and its values."""
     called = (
         "id", "index", "idx", "i", "no", "nr", "num", "number", "n", "count", "row", "sample",
         "frame", "shot", "capture", "scan", "image", "img", "cloud", "pose", "position", "point",
@@ -342,9 +342,9 @@ def _put(
         axis = axis[1]
     plain = axis in ("x", "y", "z", "w")
     # Behind a name of its own (orientation.roll) only a whole word is no part of the pose's name
-    whole = [word for word in _TURNS if len(word) > 1]
-    part, before = _without(before, (*_POSITION_WORDS, *_TURNS) if plain else whole)
-    axis = ("q" if listed else _TURNS.get(part, "") if plain else "") + axis
+    whole = [word for word in _TURN_WORDS if len(word) > 1]
+    part, before = _without(before, (*_POSITION_WORDS, *_TURN_WORDS) if plain else whole)
+    axis = ("q" if listed else _TURN_WORDS.get(part, "") if plain else "") + axis
     called = "_".join(before) or (part if part in _OPENCV else "")
     group = groups.setdefault("" if called in _OPENCV else called, Group())
     group.words = group.words or called
@@ -373,7 +373,7 @@ def _without(words: list[str], parts: Sequence[str]) -> tuple[str, list[str]]:
 
 def _put_list(groups: dict[str, Group], words: list[str], listed: str, size: int) -> None:
     if size == 9:
-        _, before = _without(words, tuple(_TURNS))
+        _, before = _without(words, tuple(_TURN_WORDS))
         group = groups.setdefault("_".join(before), Group(words="_".join(before)))
         group.rotation = listed
     else:
@@ -471,6 +471,6 @@ def role_in(name: str) -> str | None:
     frames = frames_in(name.rpartition(":")[2])
     if frames is not None:
         return "target" if "camera" in frames else "arm"
-    found = {"target": SEEN.search(name.lower()), "arm": _ARM.search(name.lower())}
+    found = {"target": SEEN.search(name.lower()), "arm": _ARM_WORDS.search(name.lower())}
     roles = [role for role, match in found.items() if match]
     return roles[0] if len(roles) == 1 else None

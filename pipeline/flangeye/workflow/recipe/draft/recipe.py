@@ -371,7 +371,7 @@ def _head(
     feature = {"sphere": target["sphere"]} if "sphere" in target else {}
     if "flange" in target and not _has_plate(robot):
         question = "which plate the flange is ('flangeye standards')"
-        feature = {"standard": _plate(questions, question)}
+        feature = {"standard": questions.ask("plate", question, PLATE, check=load_standard)}
     if "flange" in target and not robot:
         robot, feature = {"flange": feature["standard"]}, {}
     question = "which scanner ('flangeye scanners')"
@@ -393,10 +393,6 @@ def _body(mesh: str, out: Path, configuration: dict[str, Any]) -> dict[str, Any]
     name = os.path.relpath(mesh, out.parent) if Path(mesh).is_file() else mesh
     where = {"at": "unknown"} if configuration.pop("place", None) else {}
     return {"body": name, **where}
-
-
-def _plate(questions: Questions, question: str) -> str:
-    return questions.ask("plate", question, PLATE, check=load_standard)
 
 
 def _length_of_files(questions: Questions) -> str:

@@ -274,6 +274,7 @@ def _worst_corner(result: Result, estimate: TransformResult) -> Floats:
         raise StageError("nothing says where the work is: give the recipe a 'workspace'")
     box = result.workspace
     corners = corners_of(np.array(box.centre), np.array(box.size))
+    # The variance is a convex function of the place, so over a box it is largest at a corner
     motions = levers(corners - np.array(estimate.about))
     variances = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions)
     return np.asarray(corners[int(variances.argmax())])
@@ -301,6 +302,8 @@ def _of_one_pose(result: Result) -> list[Contribution]:
     corners = corners_of(np.array(box.centre), np.array(box.size))
     motions = levers(corners - np.array(estimate.about))
     own = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions).mean()
+    # A smaller difference than the standard error of the held-out variance is not detected: then
+    # that error is stated, as a bound
     hidden = _standard_error(held.rms**2, int(3 * poses))
     beyond = held.rms**2 - float(own)
     standard = np.sqrt(max(beyond, hidden) / 3)
@@ -312,6 +315,7 @@ def _of_one_pose(result: Result) -> list[Contribution]:
 def _distortion(scanner: ScannerModel) -> tuple[str, Literal["B"], float, str]:
     error = scanner.calibration_error
     evidence = f"{scanner.maker} {scanner.model}: {error * 1e3:g} mm rms over the volume"
+    # The file states the rms of a distance: each axis has a third of its variance
     return "Scanner's smooth distortion", "B", error / np.sqrt(3), evidence
 
 
@@ -320,6 +324,7 @@ def _expansion(point: Floats, spread: float) -> tuple[str, Literal["B"], float, 
     expansion = 23e-6
     half = expansion * float(np.linalg.norm(point)) * spread / 2
     evidence = f"{spread:g} K between extremes, {expansion * 1e6:g} µm/(m K), rectangular"
+    # Half the width of a rectangular distribution over the root of 3 (GUM 4.3.7), then one axis
     return "Arm's thermal expansion", "B", half / np.sqrt(3) / np.sqrt(3), evidence
 
 
