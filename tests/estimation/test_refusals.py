@@ -190,6 +190,11 @@ def test_noise_that_is_not_stated_is_found() -> None:
     assert 0.4 < beyond < 0.65
 
 
+def test_noise_that_is_not_found_is_never_called_zero() -> None:
+    made = session(MARKER, np.random.default_rng(15), n=12, noise=Noise(0.0, 0.0))
+    assert not any("0.000" in note for note in solved(made).notes)
+
+
 def shaken(made, turn, shift, deeper, seed):
     """The session with a camera's noise of its own: rotation, and place across and in depth."""
     rng, seen = np.random.default_rng(seed), []

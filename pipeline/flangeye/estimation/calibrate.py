@@ -391,9 +391,10 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
     """Return the notes for the record."""
     found, cell = session.found, session.cell
     turn, shift = _noise_beyond(found)
+    # An error of exactly nothing is never claimed
+    mm, deg = (f"{x:.3f}" if x >= 5e-4 else "below 0.001" for x in (shift * 1e3, np.degrees(turn)))
     notes: list[Note] = [
-        f"estimated noise of each pose in addition to its fit's: {shift * 1e3:.3f} mm and "
-        f"{np.degrees(turn):.3f} deg per axis"
+        f"estimated noise of each pose in addition to its fit's: {mm} mm and {deg} deg per axis"
     ]
     if len(found.problem.ends) > 1:
         who = Counter((o.camera, o.target) for o in session.observations)

@@ -19,7 +19,7 @@ from flangeye.types.geometry import quaternion_from_rotation, rpy_from_rotation
 from flangeye.workflow.log.read import RunLog
 from flangeye.workflow.log.record import dump_result
 from flangeye.workflow.recipe.load import Recipe, parse_recipe
-from flangeye.workflow.result import SIMULATED
+from flangeye.workflow.result import SIMULATED, status_of
 from flangeye.workflow.result.contract import AnswerResult, Result, TransformResult
 
 RUNS = Path("runs")
@@ -115,7 +115,7 @@ def calibration_yaml(result: Result) -> str:
     The poses are for the arm as its controller reports it. If errors of the arm were estimated,
     ``corrected_arm`` has the poses for the corrected arm, with the correction.
     """
-    document: dict[str, Any] = {"status": result.status, **_poses(result.transforms)}
+    document: dict[str, Any] = {"status": status_of(result), **_poses(result.transforms)}
     answers = result.answers
     if answers and answers.as_reported.expected_rms is not None:
         document["expected_rms_at_the_work_m"] = answers.as_reported.expected_rms
