@@ -185,11 +185,13 @@ class Tests:
         For lines that run at import or in another process only, all tests of the file (or all) are
         returned. The total is limited by a budget of processor time [s].
         """
-        of_file = self._lines.get(file, {})
-        run = self.running(file, lines)
-        run = run or {test for tests in of_file.values() for test in tests} or set(self._seconds)
         own = {test for test in self._seconds if f"/test_{Path(file).stem}.py" in test}
-        return self._within(run | own, budget, own)
+        run = self.running(file, lines)
+        if not run:
+            of_file = self._lines.get(file, {}).values()
+            run = {test for tests in of_file for test in tests} or set(self._seconds)
+            run |= own
+        return self._within(run, budget, own)
 
     def running(self, file: str, lines: range) -> set[str]:
         """Return the tests whose own process runs one of the lines."""

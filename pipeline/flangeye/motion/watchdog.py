@@ -252,14 +252,14 @@ class Watchdog:
         """Return the source of a stop request, if any, and process the program's heartbeats."""
         watched = [fd for fd in (self._charge.alarm, self._charge.keyboard) if fd is not None]
         ready = select.select(watched, [], [], 0)[0] if watched else []
-        said = {fd: os.read(fd, 64) for fd in ready}
-        signals = {*said.get(self._charge.alarm or -1, b"")}
+        said: dict[int | None, bytes] = {fd: os.read(fd, 64) for fd in ready}
+        signals = {*said.get(self._charge.alarm, b"")}
         if BEAT in signals:
             self._heard = time.monotonic()
         if stops := signals - {BEAT}:
             number = signal.Signals(min(stops))
             return STOPS.get(number, number.name)
-        return "the space bar" if b" " in said.get(self._charge.keyboard or -1, b"") else None
+        return "the space bar" if b" " in said.get(self._charge.keyboard, b"") else None
 
     def _obey(self) -> bool:
         """Execute the program's requests; return whether it is still connected."""
