@@ -22,6 +22,7 @@ class Row(NamedTuple):
         time: Time [s].
         torch_s: Arc length of the torch on the true seam.
         torch: Offset of the torch to the left of the seam.
+        tip_s: Arc length of the tip on the true seam.
         tip: Offset of the tip to the left of the seam.
         robot: Offset of the reported end point to the left of the seam.
         turn: Commanded angular velocity.
@@ -35,6 +36,7 @@ class Row(NamedTuple):
     time: float
     torch_s: float
     torch: float
+    tip_s: float
     tip: float
     robot: float
     turn: float
@@ -51,7 +53,7 @@ class Trial:
 
     Attributes:
         controller: As it ended.
-        rows: (K, 11) columns as :class:`Row` has them.
+        rows: (K, 12) columns as :class:`Row` has them.
         phases: K names.
         length: Length of the true seam [m].
     """
@@ -154,7 +156,7 @@ def _row(world: WeldWorld, pose: ToolPose, controller: Controller, command: Comm
     tip = float((world.tip[:2] - place.point) @ place.normal)
     robot = float((pose.position[:2] - place.point) @ place.normal)
     return Row(
-        pose.time, world.torch_s, world.off, tip, robot, command.turn, controller.tip,
+        pose.time, world.torch_s, world.off, s, tip, robot, command.turn, controller.tip,
         controller.bound, controller.band, getattr(controller, "aim", 0.0),
         getattr(controller, "arc_from", 0.0) is not None,
     )  # fmt: skip

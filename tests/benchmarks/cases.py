@@ -285,11 +285,11 @@ def finger() -> tuple[Work, Work]:
     from flangeye.files.paths import bundled
     from flangeye.models.finger import Finger
     from flangeye.models.model import read_model
-    from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
+    from flangeye_emulators.finger.sensor import FingerCamera, typical_compliance
     from flangeye_plugins.weld.finger_camera import FingerReader
 
     model = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
-    camera = FingerCamera(model, Optics(), np.random.default_rng(0))
+    camera = FingerCamera(model, np.random.default_rng(0))
     frame = SensorFrame(camera.image(*typical_compliance().tag(np.array([2e-3, 0.0, 1e-3]))), 0)
     reader = FingerReader(model)
     pixels = frame.image.pixels

@@ -16,7 +16,8 @@ from flangeye_paper.as_printed import controller_as_printed
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import task_of
 from flangeye_plugins.weld.settings import Following
-from tests.plugins.weld.bench import DISTANCE, World, curved, planning_error
+from tests.plugins.weld.bench import DISTANCE, curved, planning_error
+from tests.plugins.weld.bench import run as run_bench
 from tests.plugins.weld.cell import planned, run
 
 MODE = BoundPart(controller_as_printed, None)
@@ -30,7 +31,7 @@ def test_it_diverges() -> None:
     true, settings = curved(), Following()
     plan = planning_error(true, seed=0)
     controller = MODE(task_of(Path(plan), DISTANCE, settings))
-    done = World(true, plan, controller, settings, longest=40.0).run()
+    done = run_bench(true, plan, controller, settings, longest=40.0)
     assert np.sqrt(np.mean(np.square(done.deviation(-0.03)))) > 5e-3
 
 

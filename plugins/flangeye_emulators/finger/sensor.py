@@ -74,7 +74,7 @@ class SimulatedFinger(Device):
         self.tool = Tool(finger, self._surface)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
-        self._camera = FingerCamera(finger, Optics(), self._rng)
+        self._camera = FingerCamera(finger, self._rng)
         self._compliance = typical_compliance()
         self._shutter: ImageQueue[Floats] = ImageQueue(
             replace(truth.clock, hidden=params.hidden), self._rng
@@ -211,21 +211,6 @@ def sensor_simulated_finger(
     return SimulatedFinger(robot, seed, params, read_model(params.world, WeldTruth))
 
 
-@dataclass(frozen=True)
-class Optics:
-    """Defects of the images.
-
-    Attributes:
-        blur: Standard deviation of the blur [px].
-        noise: Standard deviation of the noise [grey levels].
-        glare: Brightness of a reflection that moves over the image [grey levels].
-    """
-
-    blur: float = 0.7
-    noise: float = 3.0
-    glare: float = 60.0
-
-
 @dataclass(frozen=True, eq=False)
 class Compliance:
     """True relation between the motions of tip and tag; known to the simulation only.
@@ -282,11 +267,17 @@ class FingerCamera:
     # Of the printed tag with its white margin: six of a 4x4 tag, and one on each side.
     modules: ClassVar[int] = 8
 
-    def __init__(self, finger: FingerGeometry, optics: Optics, rng: np.random.Generator) -> None:
+    # Standard deviations of the blur [px] and of the noise, and brightness of a reflection that
+    # moves over the image [grey levels].
+    blur: ClassVar[float] = 0.7
+    noise: ClassVar[float] = 3.0
+    glare: ClassVar[float] = 60.0
+
+    def __init__(self, finger: FingerGeometry, rng: np.random.Generator) -> None:
         """Prepare the tag's print; every image takes its noise from ``rng``."""
         import cv2
 
-        self._lens, self._optics, self._rng = finger.camera, optics, rng
+        self._lens, self._rng = finger.camera, rng
         marker = cv2.aruco.generateImageMarker(
             dictionary_of(finger), finger.tag.id, 6 * self.texels
         )
@@ -301,7 +292,7 @@ class FingerCamera:
         self._grain = rng.standard_normal(
             (2 * finger.camera.height, 2 * finger.camera.width), np.float32
         )
-        self._grain *= optics.noise
+        self._grain *= self.noise
         # Made once: to come by the memory takes longer than to fill it.
         shape = finger.camera.height, finger.camera.width
         self._grey, self._light = np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -358,7 +349,7 @@ class FingerCamera:
         import cv2
 
         grey, light = self._grey, self._light
-        np.copyto(grey, cv2.GaussianBlur(seen, (0, 0), self._optics.blur))
+        np.copyto(grey, cv2.GaussianBlur(seen, (0, 0), self.blur))
         np.copyto(light, self._reflection(seen.shape), casting="same_kind")
         light += self._noise(seen.shape)
         grey += light
@@ -380,7 +371,7 @@ class FingerCamera:
         across = np.exp(-(((np.arange(width) - x) / (0.12 * width)) ** 2))
         down = np.exp(-(((np.arange(height) - y) / (0.12 * height)) ** 2))
         np.outer(down, across, out=self._glare)
-        self._glare *= self._optics.glare
+        self._glare *= self.glare
         return self._glare
 
 

@@ -133,22 +133,18 @@ class TipContact:
     Attributes:
         position: (3,) position of the tip [m].
         force: (3,) force on the tip: along the seam, to the left, upwards [N].
+        s: Arc length of the tip's foot on the seam [m].
     """
 
     def __init__(self, groove: Groove, tip: Tip) -> None:
         self.position = np.zeros(3)
         self.force = np.zeros(3)
         self._groove, self._tip = groove, tip
-        self._s = 0.0
+        self.s = 0.0
         self._in_groove = False
         self._stuck: float | None = None
         self._across: float | None = None
         self._wall = (0, 0.0)
-
-    @property
-    def s(self) -> float:
-        """Arc length of the tip's foot on the seam [m]."""
-        return self._s
 
     def settle(
         self, rest: Floats, moved: float = 0.0, plane_R_tool: Floats | None = None
@@ -161,13 +157,13 @@ class TipContact:
             plane_R_tool: (3, 3) axes of the finger; upright if not given.
         """
         root = self._groove.root
-        self._s = root.foot(rest[:2], self._s)
+        self.s = root.foot(rest[:2], self.s)
         # The ball, which friction drags along behind the finger, falls off where it is itself.
-        ball = self._s if self._stuck is None else self._stuck
+        ball = self.s if self._stuck is None else self._stuck
         if not root.first <= ball <= root.last:
             return self._free(rest)
-        place = root.at(self._s)
-        fill, aside, wider = self._groove.relief.at(self._s)
+        place = root.at(self.s)
+        fill, aside, wider = self._groove.relief.at(self.s)
         across = float((rest[:2] - place.point) @ place.normal) - moved - aside
         up = float(rest[2]) - place.height - fill
         stiff, slides = self._springs(place, plane_R_tool)
@@ -177,7 +173,7 @@ class TipContact:
         along = self._drag(math.hypot(push_y, push_z)) + float(slides @ moved_by)
         self.force = np.array([self._tip.lateral * along, push_y, push_z])
         # Beyond a curve's centre a foot jumps, and the tip with it: only what moves it counts.
-        there, offset = root.at(self._s + along), moved + aside
+        there, offset = root.at(self.s + along), moved + aside
         aside_to = there.point + (y + offset) * there.normal
         aside_from = place.point + (across + offset) * place.normal
         rise = there.height - place.height + z - up
@@ -244,7 +240,7 @@ class TipContact:
 
         On a wall it moves only if the springs overcome friction.
         """
-        gone, room = self._groove.missing(self._s, self._tip.radius)
+        gone, room = self._groove.missing(self.s, self._tip.radius)
         side = 1 if across >= 0 else -1
         before, self._wall = self._wall, (0, 0.0)
         if gone == side:
@@ -285,10 +281,10 @@ class TipContact:
         if normal_force == 0.0:
             self._stuck = None
             return 0.0
-        self._stuck = self._s if self._stuck is None else self._stuck
+        self._stuck = self.s if self._stuck is None else self._stuck
         most = self._tip.friction * normal_force / self._tip.lateral
-        lag = min(max(self._stuck - self._s, -most), most)
-        self._stuck = self._s + lag
+        lag = min(max(self._stuck - self.s, -most), most)
+        self._stuck = self.s + lag
         return lag
 
 

@@ -117,7 +117,7 @@ def test_a_torch_that_the_file_has_wrong_is_scored_as_far_off(wrong: int, tmp_pa
     text = (bundled("data") / "fingers" / "srm.yaml").read_text()
     file = tmp_path / "wrong.yaml"
     file.write_text(f"{text}torch_aside: {wrong} mm\n")
-    report, _ = run(planned("v-straight", end=0.05), finger=str(file))
+    report, _ = run(planned("v-straight", end=0.05), finger=str(file), speed="10 mm/s")
     off = torch_deviation(report.true_torch, true_line("v-straight", 0.05)[5:], report.opening)
     if report.figures["share_welded"]:
         assert np.median(off) == pytest.approx(wrong * 1e-3, abs=0.3e-3)

@@ -75,7 +75,8 @@ def finger_in(truth):
 
 def weld_short(prior):
     """Weld 40 mm that were planned 1 mm off either way; return report and journal."""
-    return run(planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=0.04), seed=3, prior=prior)
+    seam = planned("v-straight", shift=(1e-3, 1e-3, 0.0), end=0.04)
+    return run(seam, seed=3, prior=prior, speed="10 mm/s")
 
 
 @cache

@@ -129,22 +129,6 @@ def test_a_trail_tells_where_the_torch_was_and_how_far_aside() -> None:
     assert trail.passing(4.4e-3) == (4e-5, 4e-9)
 
 
-def test_five_looks_in_succession_that_contradict_what_is_known_stop_the_weld() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
-    for i in range(5):
-        assert not bias.doubt
-        bias.look(i * 1e-3, 2e-3, SIGMA, 0.0)
-    assert bias.doubt
-
-
-def test_the_torch_s_places_are_remembered_every_fifth_of_a_millimetre() -> None:
-    trail = Trail()
-    for s in (0.0, 0.19e-3, 0.21e-3, 0.4e-3, 0.42e-3):
-        trail.pass_by(1.0 + s, s, s, 0.0)
-    for s, place in ((0.2e-3, 0.0), (0.3e-3, 0.21e-3), (0.41e-3, 0.21e-3), (0.5e-3, 0.42e-3)):
-        assert trail.passing(s) == (place, 0.0)
-
-
 def test_what_a_look_contradicts_is_told_with_what_was_known_before() -> None:
     bias = Bias(PRIOR, HEAT, LENGTH)
     last = looked(bias, 0.4e-3)

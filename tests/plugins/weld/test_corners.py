@@ -124,20 +124,11 @@ def test_tip_and_torch_go_round_a_corner_of_a_groove(turn: float) -> None:
     true = dense(polyline(turn, leg=0.07))
     plan = leg_of(seam_of(bench.misplaced(true, (1e-3, 1e-3, 0.0), 0.01)), told(**ROUND))
     settings = Following(max_error="1.5 mm")
-    controller = bench.make("tactile", plan.points_in_base, settings)
-    step, bounds = controller.step, list[float]()
-
-    def noted(pose, touches):
-        command = step(pose, touches)
-        bounds.append(controller.bound if controller.arc_from is not None else np.inf)
-        return command
-
-    controller.step = noted
-    done = bench.World(true, plan.points_in_base, controller, settings).run()
-    assert controller.phase == "done", controller.reason
+    done = bench.weld(true, plan.points_in_base, settings=settings)
+    assert done.controller.phase == "done", done.controller.reason
     beside = (done.torch_s > 0.0) & (done.torch_s < done.length)
     off = np.abs(done.torch[beside])
-    assert (off <= np.array(bounds)[beside]).all()
+    assert (off <= np.where(done.arc_on > 0.0, done.bound, np.inf)[beside]).all()
     assert off.max() < 0.6e-3
     assert np.sqrt(np.mean(off**2)) < 0.1e-3
 
@@ -173,6 +164,7 @@ def test_a_tip_pressed_against_one_wall_leads_the_torch_round_its_corners(turn: 
     assert np.sqrt(np.mean(found.errors**2)) < 0.1e-3
 
 
+@pytest.mark.slow
 def test_an_arc_that_the_plan_is_off_by_as_much_as_its_radius_stops_or_is_followed() -> None:
     """The arm is then near the arc's centre, from where all of its places are as near."""
     found = round_a_corner(-58.5, "groove", (-0.6e-3, 3.2e-3, 0.0), -0.0175, side="right")
@@ -200,7 +192,7 @@ def test_the_torch_comes_to_the_corner_and_goes_on_from_it(bent: FilePath, leg: 
     off = np.array([1e-3, -0.7e-3, 0.0])
     seam = seam_of(line + off)
     sensor = {"plate": "5 mm", "leg": leg}
-    report, _ = cell.run(seam, bent, sensor=sensor, joint="lap", leg=leg)
+    report, _ = cell.run(seam, bent, sensor=sensor, joint="lap", leg=leg, speed="10 mm/s")
     assert report.completed, report.reason
     start, end = line[leg - 1], line[leg]
     along = (end - start) / np.linalg.norm(end - start)

@@ -121,12 +121,3 @@ def test_the_turn_is_bounded_everywhere_and_turns_a_crooked_tool_back(degrees: A
         assert turn == pytest.approx(-np.copysign(0.35, tool[1]))
     pace = steering.pace(5e-3, tool, np.array([0.0, 1.0]), np.array([1.0, 0.0]))
     assert 0.1 * 5e-3 <= pace <= 5e-3
-
-
-def test_the_tip_waits_where_the_tool_would_have_to_turn_faster_than_it_may() -> None:
-    steering = Steering(0.04, 1.0, np.deg2rad(20.0))
-    tool, normal = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-    bend = np.array([np.cos(0.8), np.sin(0.8)])
-    pace = steering.pace(0.03, tool, normal, bend)
-    assert pace * abs(bend @ normal) / 0.04 == pytest.approx(0.8 * np.deg2rad(20.0))
-    assert steering.pace(0.03, tool, normal, np.array([1.0, 0.0])) == 0.03

@@ -36,13 +36,6 @@ def test_vision_alone_keeps_the_planning_error() -> None:
     assert rms(weld(true, plan, "vision").deviation()) == pytest.approx(2e-3, rel=0.05)
 
 
-def test_a_plan_too_high_and_tilted_is_followed_too() -> None:
-    true = straight(0.08)
-    plan = misplaced(true, (1e-3, 1e-3, 2e-3), tilt=np.deg2rad(1.0))
-    done = weld(true, plan, above=14e-3)
-    assert abs(done.deviation()).max() < 0.4e-3
-
-
 @pytest.mark.parametrize(("side", "shift"), crossed([("left",), ("right",)], [(5e-3,), (-5e-3,)]))
 def test_both_ends_of_the_seam_are_felt_and_it_is_welded_between_them(
     shift: float, side: str
@@ -63,12 +56,10 @@ def test_both_ends_of_the_seam_are_felt_and_it_is_welded_between_them(
 
 IMPORTED = """
 import sys
-from tests.plugins.weld.bench import World, make, straight
-from flangeye_plugins.weld.settings import Following
-plan, asked = straight(0.02), Following()
-world = World(plan, plan, make("tactile", plan, asked), asked)
+from tests.plugins.weld.bench import straight, weld
+plan = straight(0.02)
 before = set(sys.modules)
-print(world.run().phase[-1], sorted(set(sys.modules) - before))
+print(weld(plan, plan).phase[-1], sorted(set(sys.modules) - before))
 """
 
 
@@ -81,10 +72,9 @@ def test_nothing_is_imported_while_the_arm_moves() -> None:
     assert ended.stdout == "done []\n"
 
 
-@pytest.mark.parametrize("degrees", [90, -90])
-def test_a_tool_across_the_seam_turns_back_within_its_limit(degrees: int) -> None:
+def test_a_tool_across_the_seam_turns_back_within_its_limit() -> None:
     true = curved()
-    done = weld(true, planning_error(true, seed=0), angle=np.deg2rad(degrees))
+    done = weld(true, planning_error(true, seed=0), angle=np.deg2rad(90))
     assert abs(done.turn).max() <= LIMIT
     assert done.controller.reason.startswith("not begun")  # the bound holds too late for an arc
 
@@ -96,14 +86,16 @@ def test_a_gap_in_the_wall_is_bridged(seam: Any) -> None:
     phases = list(dict.fromkeys(done.phase))
     assert phases == ["seeking", "probing", "following", "bridging", "ending", "done"]
     regained = done.phase.index("bridging")
-    assert "following" in done.phase[regained:]
+    assert "following" in done.phase[regained:]  # along the other wall
     assert abs(done.deviation(0.055, 0.075)).max() < 0.5e-3
     assert abs(done.tip).max() < 5e-3
 
 
-def test_the_end_of_the_seam_makes_no_step() -> None:
+def test_a_plan_too_high_and_tilted_is_followed_and_its_end_makes_no_step() -> None:
     true = straight(0.08)
-    done = weld(true, planning_error(true, seed=0))
+    plan = misplaced(true, (1e-3, 1e-3, 2e-3), tilt=np.deg2rad(1.0))
+    done = weld(true, plan, above=14e-3)
+    assert abs(done.deviation()).max() < 0.4e-3
     leaving = done.tip_s > true[-1, 0] - 20e-3
     assert done.tip_s.max() > true[-1, 0] + 20e-3
     # The torch welds on as fast as before while the tip hangs past the end, pressed by nothing
@@ -135,38 +127,26 @@ def test_a_plan_that_starts_away_from_the_groove_is_refused() -> None:
     assert done.advance.max() == done.advance[0]
 
 
-def test_where_one_wall_of_a_groove_ends_the_other_leads() -> None:
-    true = straight()
-    done = weld(true, true, gaps=(Gap(0.04, 0.08, 1),))
-    assert done.phase[-1] == "done"  # the other wall leads it
-    assert np.abs(done.deviation(0.005)).max() < 0.1e-3
-
-
-def test_a_short_blindness_slows_down_and_a_long_one_stops() -> None:
+def test_a_short_blindness_slows_the_arm_down() -> None:
     true = straight(0.06)
     short = weld(true, true, hidden=(8.0, 8.35))
     assert short.controller.phase == "done"
     assert abs(short.deviation()).max() < 0.4e-3
-    long = weld(true, true, hidden=(8.0, 20.0))
-    assert long.controller.reason == "no tag was seen for 2000 ms"
-    assert long.time[-1] == pytest.approx(10.0, abs=0.1)
 
 
-@pytest.mark.parametrize("began", [8.0, 15.0])  # in the sweep; following
-@pytest.mark.parametrize("latency", [0.03, 0.1])
-def test_an_arm_that_sees_no_tag_stands_still(began: float, latency: float) -> None:
+@pytest.mark.parametrize(
+    ("began", "latency", "phase"), [(8.0, 0.03, "probing"), (15.0, 0.1, "following")]
+)
+def test_an_arm_that_sees_no_tag_stands_still_and_is_stopped(
+    began: float, latency: float, phase: str
+) -> None:
     true = straight(0.06)
     done = weld(true, true, hidden=(began, 60.0), latency=latency)
-    assert done.phase[-2] == ("probing" if began == 8.0 else "following")
+    assert done.phase[-2] == phase
+    assert done.controller.reason == "no tag was seen for 2000 ms"
     moved = np.abs(np.diff([done.torch_s, done.torch, done.robot])).max(axis=0) > 1e-7
     assert done.time[1:][moved][-1] - began < 0.3
     assert done.time[-1] == pytest.approx(began + 2.0, abs=0.1)
-
-
-def test_another_side_of_the_groove_does_as_well() -> None:
-    true = curved(0.08)
-    done = weld(true, planning_error(true, seed=1), settings=Following(side="right"))
-    assert abs(done.deviation()).max() < 0.4e-3
 
 
 @pytest.mark.slow

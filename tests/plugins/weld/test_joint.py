@@ -108,7 +108,7 @@ def test_springs_balance_on_the_wall_of_a_leaning_finger() -> None:
     [
         pytest.param("T-fillet, upright tool", marks=pytest.mark.slow),
         "T-fillet, pressed on the right, upright tool",
-        "T-fillet, tool leans 40 deg away, 10 deg forwards",
+        pytest.param("T-fillet, tool leans 40 deg away, 10 deg forwards", marks=pytest.mark.slow),
         pytest.param(
             "T-fillet, plates at 91 deg, tool leans 1 deg more than set", marks=pytest.mark.slow
         ),
@@ -116,7 +116,7 @@ def test_springs_balance_on_the_wall_of_a_leaning_finger() -> None:
         "lap joint, plate of 5 mm, tool leans 20 deg away",
         "butt joint, square edges, root gap 2.2 mm",
         "corner joint, open, tool leans 10 deg forwards",
-        "torch led 1 mm to the left",
+        pytest.param("torch led 1 mm to the left", marks=pytest.mark.slow),
     ],
 )
 def test_the_torch_is_on_the_seam_of_every_joint(name: str) -> None:
@@ -164,7 +164,7 @@ def test_a_leaning_tool_on_an_arm_and_a_fillet_on_an_inclined_plate() -> None:
         openings_in_base=flat.openings_in_base @ turned.T,
     )  # fmt: skip
     report, _ = cell.run(
-        seam, joint="fillet", work_angle="25 deg", preload="1.2 mm",
+        seam, joint="fillet", work_angle="25 deg", preload="1.2 mm", speed="10 mm/s",
         sensor={"plate": "20 mm", "rpy": ["12 deg", "-8 deg", "20 deg"]},
     )  # fmt: skip
     assert report.completed, report.reason

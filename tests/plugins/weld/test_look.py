@@ -18,8 +18,6 @@ from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler
 from flangeye_emulators.weld_world.truth import ClockTruth, ProfilerTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
-from flangeye_plugins.weld.following.follower import Follower
-from flangeye_plugins.weld.resuming import resume_point_of
 from flangeye_plugins.weld.settings import WeldTactileParams
 from tests.plugins.weld.cell import planned, run
 from tests.plugins.weld.test_camera_process import Camera, first_sight, state
@@ -29,7 +27,7 @@ from tools.weld_conditions import CONDITIONS, Condition
 
 ASIDE = WeldTruth(tool=ToolTruth(torch=(0.0, 0.3e-3)), clock=ClockTruth(rate=15.0))
 LOOK = BoundPart(profiler_simulated, SimulatedProfilerParams(behind="10 mm"))
-SETTINGS = {"distortion": "0.15 mm", "max_error": "2 mm"}
+SETTINGS = {"distortion": "0.15 mm", "max_error": "2 mm", "speed": "8 mm/s"}
 SHORT = 0.09
 
 
@@ -64,24 +62,6 @@ def test_every_decision_is_repeated_from_the_log(weld: Any, tmp_path: Path) -> N
     ((_, redone),) = replay_steps(path, load_registry())
     assert redone.same
     assert max(redone.figures.values()) == 0.0
-
-
-def test_without_its_looks_a_weld_is_decided_otherwise(weld: Any, tmp_path: Path) -> None:
-    blind = [(name, value) for name, value in weld[1] if name != "profile"]
-    ((_, redone),) = replay_steps(logged(blind, tmp_path / "run.mcap"), load_registry())
-    assert not redone.same
-
-
-def test_a_weld_that_was_stopped_is_stepped_through_with_its_looks(
-    weld: Any, tmp_path: Path
-) -> None:
-    journal = weld[1]
-    blocks = [i for i, (name, _) in enumerate(journal) if name == "cycles"]
-    stopped = journal[: blocks[-4]]
-    points = np.array(next(value for name, value in journal if name == "start")["points"])
-    kept = resume_point_of(logged(stopped, tmp_path / "run.mcap"), points)
-    assert kept is not None
-    assert kept.torch == pytest.approx(journal[blocks[-5]][1]["torch"][-1])
 
 
 @pytest.mark.parametrize(
@@ -190,12 +170,3 @@ def test_a_torch_that_the_files_have_elsewhere_is_told() -> None:
     assert not found.done
     assert "the profile sensor behind the torch sees the bead +1." in found.controller.reason
     assert "calibrate the tool" in found.controller.reason
-
-
-def test_a_look_is_not_taken_for_what_no_torch_passed() -> None:
-    trial = try_condition(Condition(), 0, 0.05, 16e-3)
-    follower = trial.controller
-    assert isinstance(follower, Follower)
-    follower.looked(WeldProfile(1e-3, 0.05e-3, 10**9))
-    assert follower.welding.bias.value == 0.0
-    assert not follower.welding.bias.looked

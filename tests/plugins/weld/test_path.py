@@ -92,9 +92,3 @@ def test_at_its_very_end_a_path_is_at_its_last_point_and_climbs_as_it_does_there
     assert points[0] == pytest.approx(path.points[-1], abs=1e-12)
     rise = float(path.points[-1, 2] - path.points[-2, 2])
     assert path.climb(path.length) == pytest.approx(rise / path.step, abs=1e-3)
-
-
-def test_before_its_start_a_path_has_no_curve() -> None:
-    path = arc(0.05)
-    assert path.sharpest(-0.02, -0.01) == 0.0
-    assert path.sharpest(-0.02, 0.001) == pytest.approx(20.0, rel=0.02)

@@ -137,36 +137,6 @@ def test_a_tip_on_one_wall_keeps_pressing_it() -> None:
     assert turns_of(places) == pytest.approx([1.25 * d, 0.375 * d, 0.75 * d], abs=1e-6)
 
 
-def test_a_sweep_s_speed_swings_so_that_no_delay_looks_like_play() -> None:
-    """Between a fifth of it and all of it; it is that across the seam, at most 4 mm/s."""
-    _, speeds = driven(going(deflection="9 mm"), 0.5e-3)
-    forwards = speeds[speeds > 0][:280]
-    assert forwards.max() == pytest.approx(4e-3, rel=0.01)
-    assert forwards.min() == pytest.approx(0.2 * 4e-3, rel=0.05)
-    peaks = np.flatnonzero((forwards[1:-1] > forwards[:-2]) & (forwards[1:-1] >= forwards[2:]))
-    assert np.diff(peaks) * PERIOD == pytest.approx(0.8, abs=2 * PERIOD)
-
-
-def test_a_sweep_begins_where_the_tip_has_come_to_rest() -> None:
-    found = going(noise=0.1e-3)
-    enough = (0.1 / 0.03) ** 2
-    for cycle in range(2000):  # it slides first, and rests in the newer half
-        assert found.velocity(PERIOD) == (0.0, 0.0)
-        if found._wanted is not None:
-            break
-        found.note(cycle * PERIOD, 0.0, 0.0)
-        found.feel(cycle * PERIOD, -(3e-3 if cycle < 12 else 1e-3), 0.0, 0.0)
-    assert found._wanted == pytest.approx(1e-3)
-    assert cycle * PERIOD > 0.4 - 2 * PERIOD and cycle >= enough
-    unseen = going()
-    waited = 0.0
-    while unseen._wanted is None:
-        unseen.velocity(PERIOD)
-        waited += PERIOD
-    assert unseen._wanted == 1.25 * SETTINGS.deflection / 3  # nothing says otherwise
-    assert waited == pytest.approx(4.0, abs=2 * PERIOD)
-
-
 @pytest.mark.parametrize("stops", [0.0, 1.0, 1.7])
 def test_a_sweep_begins_when_the_arm_stands_and_by_what_is_felt_since(stops: float) -> None:
     """An arm goes on for a while when it is told to stop, longest where it turned as well."""
@@ -182,8 +152,14 @@ def test_a_sweep_begins_when_the_arm_stands_and_by_what_is_felt_since(stops: flo
     assert max(stops, 0.4) - 0.1 < cycle * PERIOD < max(stops + 0.2, 0.4) + 2 * PERIOD
 
 
-def test_a_standing_loop_commands_nothing() -> None:
-    found = going()
+def test_a_standing_loop_commands_nothing_and_a_sweep_waits_four_seconds_for_its_tag() -> None:
+    found, waited = going(), 0.0
+    while found._wanted is None:
+        assert found.velocity(PERIOD) == (0.0, 0.0)
+        waited += PERIOD
+    assert found._wanted == 1.25 * SETTINGS.deflection / 3 and waited == pytest.approx(
+        4.0, abs=0.02
+    )
     found._wanted = 0.5e-3
     assert found.velocity(0.0) == (0.0, 0.0)
 
@@ -269,18 +245,6 @@ def test_a_gain_is_known_as_well_as_a_line_through_so_many_measurements() -> Non
     assert askew == pytest.approx(math.hypot(sigma, 0.04), rel=0.05)
 
 
-def test_a_tag_that_is_seen_less_than_fifteen_times_says_nothing() -> None:
-    found = going()
-    for i in range(14):
-        found.feel(0.1 * i, -1e-3, 0.0, 0.0)
-    assert found.learned() == "the tag was seen too seldom while the finger was probed"
-    full = fitted()
-    full._felt = full._felt[::13][:15]
-    assert isinstance(full.learned(), SweepFit)
-    full._felt.pop()
-    assert "too seldom" in full.learned()
-
-
 def test_measurements_scatter_as_their_second_differences_do() -> None:
     """A drift is not a scatter, and one that is far off counts little."""
     rng = np.random.default_rng(0)
@@ -315,7 +279,7 @@ def test_where_in_its_play_a_finger_began_changes_nothing(
     assert learned.unexplained < 0.02e-3
 
 
-@pytest.mark.parametrize("images", [0, 1, 2, 3])
+@pytest.mark.parametrize("images", [0, 14])
 def test_a_sweep_in_which_the_tag_is_hardly_seen_comes_to_its_end_and_says_so(images: int) -> None:
     found = going()
     for cycle in range(6000):
@@ -327,14 +291,7 @@ def test_a_sweep_in_which_the_tag_is_hardly_seen_comes_to_its_end_and_says_so(im
     assert found.over and "seen too seldom" in found.learned()
 
 
-def test_a_finger_that_is_not_probed_is_taken_as_its_file_says_to_a_twentieth() -> None:
-    known = SweepFit()
-    assert known.gain_sigma == 0.05 and known.noise == 10e-6
-    off = (known.gain, known.width, known.stamp, known.dead_time, known.lag, known.askew)
-    assert off == (0.0,) * 6 and known.unexplained == 0.0
-
-
-@pytest.mark.parametrize("over", [0.02e-3, 0.1e-3, 0.2e-3, 0.4e-3, 1e-3])
+@pytest.mark.parametrize("over", [0.02e-3, 0.2e-3, 1e-3])
 def test_play_and_hysteresis_are_found_that_are_gone_through_over_so_much(over: float) -> None:
     found = learned(width=0.04e-3, over=over, noise=1e-6)
     assert found.width == pytest.approx(-0.04e-3, rel=0.03) and found.unexplained < 5e-6

@@ -48,7 +48,7 @@ def test_the_same_commands_come_from_what_was_logged(journal: Any, tmp_path: Pat
 
 
 def test_another_command_is_noticed(journal: Any, tmp_path: Path) -> None:
-    changed = copy.deepcopy(journal)
+    changed = copy.deepcopy(journal[: len(journal) // 3])
     block = next(value for name, value in reversed(changed) if name == "cycles")
     block["turn"][0] += 1e-4
     ((_, redone),) = replay_steps(logged(changed, tmp_path / "run.mcap"), load_registry())
@@ -57,8 +57,8 @@ def test_another_command_is_noticed(journal: Any, tmp_path: Path) -> None:
 
 
 def test_another_image_is_noticed(journal: Any, tmp_path: Path) -> None:
-    images = [i for i, (name, _) in enumerate(journal) if name == "image"]
-    changed = list(journal)
+    changed = journal[: len(journal) // 3]
+    images = [i for i, (name, _) in enumerate(changed) if name == "image"]
     changed[images[-1]], changed[images[12]] = changed[images[12]], changed[images[-1]]
     ((_, redone),) = replay_steps(logged(changed, tmp_path / "run.mcap"), load_registry())
     assert not redone.same

@@ -19,7 +19,8 @@ from flangeye_plugins.weld.passes import MultiPassController
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import RUN_IN, controller_of, restart, resume_point_of
 from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
-from tests.plugins.weld.bench import DISTANCE, World, straight
+from tests.plugins.weld import bench
+from tests.plugins.weld.bench import DISTANCE, straight
 from tests.plugins.weld.cell import planned, run, true_line
 from tests.plugins.weld.test_replay import logged
 
@@ -36,23 +37,15 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return report, logged(journal, tmp_path_factory.mktemp("stopped") / "run.mcap")
 
 
-def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped: Any, tmp_path: Any) -> None:
+def test_the_torch_goes_back_overlaps_and_comes_to_the_end(stopped: Any) -> None:
     before, log = stopped
-    report, journal = run(SEAM, seed=4, speed="10 mm/s", resume=log)
+    report, _ = run(SEAM, seed=4, speed="10 mm/s", resume=log)
     assert report.completed
     assert report.along[0] == pytest.approx(before.along[-1] - 30e-3 - RUN_IN, abs=2e-3)
     welding = report.along > before.along[-1]
     assert torch_deviation(
         report.torch[welding], true_line("v-straight", END), report.opening
     ).max() < 0.4e-3  # fmt: skip
-    ((_, redone),) = replay_steps(logged(journal, tmp_path / "run.mcap"), load_registry())
-    assert redone.same
-
-
-def test_a_seam_that_has_moved_meanwhile_is_noticed(stopped: Any) -> None:
-    moved = {"position": ("600 mm", "0.6 mm", "250 mm")}
-    report, _ = run(SEAM, sensor=moved, seed=4, speed="10 mm/s", resume=stopped[1])
-    assert "the seam has moved by 0." in report.reason
 
 
 def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(
@@ -63,6 +56,8 @@ def test_a_log_that_breaks_off_is_gone_on_with_as_far_as_it_goes(
     whole, part = resume_point_of(stopped[1], PLAN), resume_point_of(torn, PLAN)
     assert 0.0 < part.torch < whole.torch
     assert len(part.samples) < len(whole.samples)
+    torn.write_bytes(stopped[1].read_bytes()[:1_500_000])  # the torch was not on the seam yet
+    assert resume_point_of(torn, PLAN) is None
 
 
 def test_what_cannot_be_gone_on_with_is_refused(stopped: Any, tmp_path: Any) -> None:
@@ -72,12 +67,6 @@ def test_what_cannot_be_gone_on_with_is_refused(stopped: Any, tmp_path: Any) -> 
             resume_point_of(stopped[1], other)
     with pytest.raises(StageError, match="holds no tactile weld to resume"):
         resume_point_of(logged([], tmp_path / "empty.mcap"), PLAN)
-
-
-def test_before_the_torch_was_on_the_seam_there_is_nothing_to_keep(tmp_path: Any) -> None:
-    hidden = {"hidden": ("12 s", "60 s")}
-    _, journal = run(SEAM, sensor=hidden, seed=3, speed="10 mm/s")
-    assert resume_point_of(logged(journal, tmp_path / "run.mcap"), PLAN) is None
 
 
 def test_a_later_pass_goes_back_overlaps_and_the_passes_after_it_follow(tmp_path: Any) -> None:
@@ -119,7 +108,7 @@ def test_far_along_the_seam_the_torch_is_lit_where_the_overlap_begins() -> None:
     start = restart(PARAMS, plan, DISTANCE, kept)
     task = WeldTask(plan, ModelPrior(DISTANCE), PARAMS, before=kept, given=start)
     follower = Follower(task)
-    World(line, line, follower, PARAMS, start=start.tip).run()
+    bench.run(line, line, follower, PARAMS, start=start.tip)
     assert (follower.phase, follower.reason) == ("done", "")
     assert follower.welding.arc_from == pytest.approx(0.14, abs=0.2e-3)
 

@@ -136,20 +136,20 @@ def test_a_doubt_stops_the_arm_on_its_way_to_the_seam(change: Any, told: str) ->
     [*(pytest.param(*doubt, marks=pytest.mark.slow) for doubt in DOUBTS[:2]), DOUBTS[2]],
 )
 def test_a_doubt_stops_the_weld_and_the_log_is_kept(change: Any, told: str) -> None:
-    arm = Arm(change, after=15.0)
+    arm = Arm(change, after=11.0)
     report, journal = run(planned("v-straight", end=SHORT), driver=driver_of(arm))
     assert report.reason.startswith(f"simulated ur10e: {told}")
     assert not report.completed
     assert arm.stopped
     times = [time for name, value in journal if name == "cycles" for time in value["time"]]
-    assert times[-1] == pytest.approx(15.0, abs=0.05)
+    assert times[-1] == pytest.approx(11.0, abs=0.05)
 
 
 def test_ctrl_c_stops_the_arm_and_the_log_is_kept() -> None:
     def interrupted(state):
         raise KeyboardInterrupt
 
-    arm, journal = Arm(interrupted, after=15.0), list[tuple[str, object]]()
+    arm, journal = Arm(interrupted, after=11.0), list[tuple[str, object]]()
     with pytest.raises(KeyboardInterrupt):
         run(planned("v-straight", end=SHORT), driver=driver_of(arm), journal=journal)
     assert arm.stopped

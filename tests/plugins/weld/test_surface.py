@@ -140,7 +140,10 @@ def test_the_tip_goes_as_it_is_told_and_the_tool_stays_as_it_is_to_stand(seam: A
     assert away > np.cos(np.radians(0.5))
 
 
-@pytest.mark.parametrize(("seam", "end"), [(pipe_on_plate, 360.0), (pipe_on_pipe, 110.0)])
+@pytest.mark.parametrize(
+    ("seam", "end"),
+    [(pipe_on_plate, 360.0), pytest.param(pipe_on_pipe, 110.0, marks=pytest.mark.slow)],
+)
 def test_the_torch_keeps_to_a_seam_that_bends_out_of_every_plane(
     seam: Any, end: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -159,7 +159,9 @@ def test_a_mode_that_no_plugin_offers_is_named_with_those_that_are_there() -> No
 
 
 def test_the_torch_is_scored_where_it_truly_is_and_not_where_it_is_believed() -> None:
-    report, _ = run(planned("v-straight", end=0.04), sensor={"world": "torch_aside"})
+    report, _ = run(
+        planned("v-straight", end=0.04), sensor={"world": "torch_aside"}, speed="10 mm/s"
+    )
     assert report.completed
     believed = torch_deviation(report.torch, true_line("v-straight"), report.opening)
     true = torch_deviation(report.true_torch, true_line("v-straight"), report.opening)

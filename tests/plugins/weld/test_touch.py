@@ -13,7 +13,7 @@ from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.model import read_model
 from flangeye.types import Image
-from flangeye_emulators.finger.sensor import FingerCamera, Optics, typical_compliance
+from flangeye_emulators.finger.sensor import FingerCamera, typical_compliance
 from flangeye_plugins.sensor import (
     ImageFolderParams,
     McapParams,
@@ -33,9 +33,9 @@ COMPLIANCE = typical_compliance()
 class Eye:
     """A camera over a tip that can be put anywhere."""
 
-    def __init__(self, seed=0, **optics):
+    def __init__(self, seed=0):
         rng = np.random.default_rng(seed)
-        self.camera = FingerCamera(FINGER, Optics(**optics), rng)
+        self.camera = FingerCamera(FINGER, rng)
         self.detector = TagDetector(FINGER)
 
     def image(self, displacement):

@@ -9,7 +9,7 @@ import pytest
 from flangeye.errors import StageError
 from flangeye_plugins.weld.checks import check_weave
 from flangeye_plugins.weld.following.steering import Weave, WeaveOffset
-from flangeye_plugins.weld.passes import MultiPassController, follower_of
+from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.resuming import controller_from
 from flangeye_plugins.weld.settings import Following
 from tools.weld_bench import curved, misplanned, try_condition
@@ -76,28 +76,7 @@ def by_pass(found):
         if "passes" in name
     ],
 )
-def test_every_pass_is_where_it_was_asked_to_be(name: str) -> None:
-    found = try_condition(CONDITIONS[name], 0, SHORT, PERIOD)
-    assert found.done, found.controller.reason
-    asked = CONDITIONS[name].settings["passes"]
-    passes = by_pass(found)
-    assert len(passes) == 1 + len(asked)
-    assert [rms(each) < 0.1e-3 for each in passes] == [True] * len(passes)
-    assert (found.errors <= found.column("bound")[found.beside]).all()
-
-
-def test_a_pass_that_is_not_known_well_enough_stops_the_weld() -> None:
-    """The root pass just stays within it; the next one adds what the arm and heat may do."""
-    doubtful = Condition(settings={
-        "passes": [{"across": "1 mm"}], "distortion": "0.15 mm", "max_error": "1 mm", "sigmas": 4.0,
-    })  # fmt: skip
-    found = try_condition(doubtful, 0, SHORT, PERIOD)
-    assert found.phases[-1] == "stopped"
-    assert found.controller.reason.startswith("in pass 2 the torch is known to 1.")
-
-
-def test_passes_are_decided_again_from_what_a_log_holds() -> None:
-    asked = Condition(settings={"passes": [{"across": "2 mm", "weave_width": "1 mm"}]})
+def test_every_pass_is_where_it_was_asked_to_be_and_decided_again_from_its_log(name: str) -> None:
     given = []
 
     def listening(controller):
@@ -109,12 +88,18 @@ def test_passes_are_decided_again_from_what_a_log_holds() -> None:
 
         controller.step = heard
 
-    found = try_condition(asked, 0, 0.06, PERIOD, listening)
-    assert isinstance(found.controller, MultiPassController)
+    asked = CONDITIONS[name]
+    found = try_condition(asked, 0, SHORT, PERIOD, listening)
+    assert found.done, found.controller.reason
+    passes = by_pass(found)
+    assert len(passes) == 1 + len(asked.settings["passes"])
+    assert [rms(each) < 0.1e-3 for each in passes] == [True] * len(passes)
+    assert (found.errors <= found.column("bound")[found.beside]).all()
     root = follower_of(found.controller)
     start = {
-        "points": misplanned(curved(0.06), 0, *asked.planned).tolist(), "wraps": 0.0, "mode": "tactile",
-        "prior": asdict(root.task.prior), "settings": root.task.settings.model_dump(mode="json"),
+        "points": misplanned(curved(SHORT), 0, *asked.planned).tolist(), "wraps": 0.0,
+        "mode": "tactile", "prior": asdict(root.task.prior),
+        "settings": root.task.settings.model_dump(mode="json"),
     }  # fmt: skip
     again = controller_from(json.loads(json.dumps(start)))
     for pose, touches, command in given:
@@ -122,3 +107,13 @@ def test_passes_are_decided_again_from_what_a_log_holds() -> None:
         np.testing.assert_array_equal(decided.velocity, command.velocity)
         assert decided.turn == command.turn
     assert again.phase == "done"
+
+
+def test_a_pass_that_is_not_known_well_enough_stops_the_weld() -> None:
+    """The root pass just stays within it; the next one adds what the arm and heat may do."""
+    doubtful = Condition(settings={
+        "passes": [{"across": "1 mm"}], "distortion": "0.15 mm", "max_error": "1 mm", "sigmas": 4.0,
+    })  # fmt: skip
+    found = try_condition(doubtful, 0, SHORT, PERIOD)
+    assert found.phases[-1] == "stopped"
+    assert found.controller.reason.startswith("in pass 2 the torch is known to 1.")
