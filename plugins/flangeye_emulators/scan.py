@@ -28,6 +28,6 @@ def scan_simulated(look: Look | None, seed: Seed, params: SimulatedScanParams) -
     # Gives this use of the recipe's seed a stream of its own
     rng = np.random.default_rng([7, seed])
     bodies = bench_with(workpiece, params.base_T_part, params.covered, rng)
-    note = f"workpiece: {workpiece.title}, simulated, with {CLUTTER} things about it"
+    note = f"workpiece: {workpiece.title}, simulated, with {CLUTTER} other objects around it"
     truth = params.true_seams(workpiece)
     return WorkpieceScan(look(bodies), f"simulated {params.workpiece.stem}", (note,), truth)

@@ -345,7 +345,7 @@ def _estimate(
 
 
 def _shared(found: Estimate) -> Floats:
-    """Return the amount of each error that the features share [standard deviations]."""
+    """Return each error common to all features, in its prior standard deviations."""
     means = [mean for _, mean, _ in found.numbers("shared")]
     return np.concatenate(means) if means else np.zeros(0)
 

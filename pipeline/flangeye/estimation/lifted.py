@@ -60,7 +60,7 @@ class Factors:
 
     @property
     def unknowns(self) -> Indices:
-        """Return (N, 2) the indices of U and V."""
+        """Return (N, 2) the indices of the unknown transforms U and V."""
         return np.stack([self.u, self.v], axis=1)
 
     def where(self, which: Mask) -> Factors:

@@ -111,7 +111,7 @@ def _arc(radius: float, start: float, sweep: float) -> Floats:
 
 
 def _polyline(name: str, groups: list[Group], closed: bool) -> Floats:
-    """Return the line through vertices and arcs; a bulge is the tangent of a quarter angle."""
+    """Return the line through vertices and arcs; an arc's bulge is tan(angle / 4)."""
     height = next((float(v) for c, v in groups if c == 38), 0.0)
     first = (10,) if name == "LWPOLYLINE" else (0,)
     vertices: list[list[float]] = []

@@ -113,7 +113,7 @@ class NextBest:
         return int(best.id), best.camera, best.target
 
     def _in_view(self, like: Observation, found: Preview) -> list[Observation]:
-        """Return random moments at which a pair is in view, by the present estimate."""
+        """Return predicted observations of a target by a camera that sees it, at random moments."""
         moments = self._planned.moments
         # Moments that are compared for each camera and target
         drawn = self._rng.choice(DRAWS, 100, replace=False)

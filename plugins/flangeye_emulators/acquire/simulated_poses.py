@@ -46,7 +46,7 @@ class OutlierParams(Params):
     gross: ClassVar[Floats] = np.repeat([0.5, 0.1], 3)
 
     def wrong(self, count: int, rng: np.random.Generator) -> Indices:
-        """Return the random sightings that are outliers, of ``count``."""
+        """Return which of ``count`` sightings are outliers, drawn at random."""
         return rng.permutation(count)[: round(self.outliers * count)]
 
     def measured(

@@ -73,7 +73,7 @@ class Relief:
     half_angle: tuple[float, ...]
 
     def at(self, s: float) -> tuple[float, float, float]:
-        """Return fill [m], aside [m] and half angle [rad] at an arc length."""
+        """Return the height filled [m], lateral shift [m] and half angle [rad] at an arc length."""
         index = min(max(int(s / TICK), 0), len(self.fill) - 1)
         return self.fill[index], self.aside[index], self.half_angle[index]
 

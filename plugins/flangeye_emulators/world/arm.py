@@ -23,8 +23,8 @@ class ErrorSizes(NamedTuple):
 
 
 REAL = ErrorSizes(1e-3, 0.15e-3, 0.2e-3, 0.4e-3, 2e-3, 0.1e-3, 0.1e-3)
-"""Sizes at which simulated sessions leave what published recordings of such arms leave after a
-plain fit: 0.35 to 0.7 mm rms, most of it smooth over the workspace."""
+"""Sizes with which a rigid fit of simulated sessions has the residuals of published recordings of
+such arms: 0.35 to 0.7 mm rms, most of it smooth over the workspace."""
 
 
 class ArmErrors(Params):

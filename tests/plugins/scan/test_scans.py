@@ -26,7 +26,7 @@ def test_the_simulated_scan_shows_the_true_seam() -> None:
     near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 5e-3
     assert np.quantile(points[near, 2], 0.02) == pytest.approx(middle[2], abs=1e-3)
     assert scan.notes == (
-        "workpiece: Plate with a straight V-groove, simulated, with 6 things about it",
+        "workpiece: Plate with a straight V-groove, simulated, with 6 other objects around it",
     )
 
 

@@ -234,7 +234,7 @@ def _shape(value: Any) -> tuple[int, ...]:
 
 
 def _side_by_side(where: Callable[[int], str], data: Mapping[str, Any]) -> list[Rows]:
-    """Return a table of all lists of one length as columns, for each length that has a stack."""
+    """Return the lists of equal length as a table each, for lengths at which poses are stacked."""
     lists = dict(_lists("", data))
     records = [value for value in lists.values() if _are_records(value)]
     if len(records) == 1:

@@ -231,8 +231,7 @@ class MountedSection(RecipeSection):
     on: str = "base"
     """Frame that it is mounted on: base, or an arm, rail or positioner of the cell by name."""
     place: Place = "known"
-    """Where its base is on that: known (at its origin), unknown (to be found), or position and
-    rpy."""
+    """Its pose in that frame: known (at its origin), unknown (to be found), or position and rpy."""
 
 
 class CellArmSection(SecondRobotSection, MountedSection):

@@ -389,7 +389,7 @@ def _head(
 
 
 def _body(mesh: str, out: Path, configuration: dict[str, Any]) -> dict[str, Any]:
-    """Return the section of a body; where a camera in the hand sees it has to be found."""
+    """Return a body's section; its place is unknown if the camera is on the flange."""
     name = os.path.relpath(mesh, out.parent) if Path(mesh).is_file() else mesh
     where = {"at": "unknown"} if configuration.pop("place", None) else {}
     return {"body": name, **where}
