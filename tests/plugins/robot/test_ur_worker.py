@@ -118,7 +118,7 @@ def test_an_arm_at_rest_is_moved_at_once_and_stopped_by_the_kind_of_its_move(
     cell: Cell, move: str
 ) -> None:
     given, told, stop = MOVES[move]
-    assert not cell.commander.busy()
+    assert not cell.commander.busy() and cell.commander.remote == -1  # not asked yet
     cell.commander.stop()
     getattr(cell.commander, move)(*given)
     assert cell.done() == [told]
