@@ -102,6 +102,21 @@ def test_a_piece_leads_a_tenth_of_a_second_ahead_and_then_brakes_to_rest() -> No
     assert not rest.speeds.any()
 
 
+def test_a_move_at_half_a_thousandth_of_a_radian_a_second_takes_its_time() -> None:
+    pieces = driven(joint_path(START, START + way(1e-3), 5e-4, 1.0))
+    assert len(pieces) * TICK == pytest.approx(2.0005 + 0.1 - 0.03, abs=0.75 * TICK)
+    np.testing.assert_allclose(pieces[-1][-1].joints, START + way(1e-3), atol=1e-9)
+
+
+def test_where_the_motion_ends_its_points_are_no_nearer_than_a_sample() -> None:
+    # In steps of 15 ms 57 ms are left once: 7 ms behind a point that stands 50 ms ahead
+    goal, last = START + way(LONG[0]), list[list[float]]()
+    for piece in driven(joint_path(START, goal, *LONG[1:]), 0.015):
+        if np.allclose(piece[-1].joints, goal, rtol=0.0, atol=1e-12):
+            last.append([point.after for point in piece[now_of(piece) :]])
+    assert len(last) > 3 and all(np.diff(after).min() > 0.0099 for after in last)
+
+
 def test_a_brisk_brake_takes_no_longer_than_it_has_to() -> None:
     motion = joint_path(START, START + way(2.0), 0.5, 10.0)
     *_, last, rest = driven(motion, most=60)[-1]
