@@ -14,6 +14,7 @@ import numpy as np
 
 from flangeye.estimation.effects.arm import QUALITY, Scatter, arm_scatters
 from flangeye.estimation.effects.effect import Effect
+from flangeye.estimation.effects.walk import innovations
 from flangeye.estimation.graph import Linear, Places, Problem, Sightings
 from flangeye.estimation.mixed import (
     Fit,
@@ -79,7 +80,12 @@ class Estimate:
         """Return the estimate without some sightings; variance components and outliers stay."""
         inliers = self.inliers.copy()
         inliers[rows] = False
-        return replace(self, posterior=self.posterior.without(rows), inliers=inliers)
+        known = self.posterior.without(rows)
+        if any(self.problem.walk):  # what the others predict of the drift is another without them
+            shares = inliers.astype(float)
+            model = model_at(self.problem, self.places, self.effects, shares)
+            known = self.posterior.refitted(model)
+        return replace(self, posterior=known, inliers=inliers)
 
     @property
     def counts(self) -> list[int]:
@@ -136,7 +142,7 @@ def model_at(
     alone = len(effects) + len(parts) + np.arange(len(further))
     # The exactest sightings [rad, m]: a thousandth of the noise any camera has
     floor = s.projectors @ np.diag(np.repeat(np.square((1e-6, 1e-7)), 3)) @ s.projectors
-    return LinearModel(
+    model = LinearModel(
         (s.projectors @ linear.residuals[..., None])[..., 0],
         design,
         6 * len(problem.unknown),
@@ -147,6 +153,7 @@ def model_at(
         prior_of(effects, counts, len(parts), scatters),
         shares,
     )
+    return innovations(problem, model) if of_session and any(problem.walk) else model
 
 
 def _design(

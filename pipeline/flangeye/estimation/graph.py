@@ -113,12 +113,15 @@ class Problem:
         ends: Frame names (camera, target); the sightings' ``pairs`` are indices into this.
         seen: N sightings.
         carriers: Frames that a controller moves.
+        walk: Shares of a sighting's turn and shift that stay in the next ones; above 0 if what the
+            camera reports drifts like a random walk, as visual odometry does.
     """
 
     frames: Mapping[str, Frame]
     ends: Sequence[tuple[str, str]]
     seen: Sightings
     carriers: Sequence[Carrier] = ()
+    walk: Sequence[float] = (0.0, 0.0)
 
     @property
     def unknown(self) -> list[str]:

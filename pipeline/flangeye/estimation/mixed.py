@@ -320,6 +320,11 @@ class Posterior:
         left = self.model.weighted(shares)
         return replace(self, model=left, mode=mode, fits=tuple(fits))
 
+    def refitted(self, model: LinearModel) -> Posterior:
+        """Return the estimate by another model of the sightings; variance components stay."""
+        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.fits))
+        return replace(self, model=model, mode=mode, fits=tuple(fits))
+
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     """Return the covariance of (A, P + K) rows of the unknowns, split by cause.

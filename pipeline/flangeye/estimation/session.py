@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from flangeye.estimation.effects.clock import clock_effects, delayed
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.effects.scanner import scanner_effects
 from flangeye.estimation.effects.target import offset_shown_to, target_effects, wrong_offset
+from flangeye.estimation.effects.walk import innovations, serial_correlation
 from flangeye.estimation.estimate import Estimate, estimate, model_at
 from flangeye.estimation.graph import Carrier, Places, Problem
-from flangeye.estimation.mixed import TELLING, fit
+from flangeye.estimation.mixed import TELLING, fit, mode_of, whitened
 from flangeye.estimation.observability import (
     IN_LINE,
     fewest_sightings,
@@ -90,7 +92,7 @@ class Session:
             replace(c, joints=joints[c.frame] if c.joints is None else c.joints)
             for c in problem.carriers
         ]
-        problem = replace(problem, carriers=carriers)
+        problem = replace(problem, carriers=carriers, walk=self.found.problem.walk)
         found = estimate(problem, self.found.places, self.found.effects, self.found.inliers)
         return replace(self, observations=observations, found=found)
 
@@ -132,7 +134,7 @@ def session_of(
     effects = effects_of(problem, scanner, asked)
     found = estimate(problem, places, effects, agree)
     session = Session(observations, cell, scanner, asked, found, (*notes, *branch_notes))
-    session = _with_bad_normals_left_out(session)
+    session = _with_walk(_with_bad_normals_left_out(session))
     _require_majority(session.found)
     return _with_offset(_with_size(_on_one_clock(session), factor))
 
@@ -330,6 +332,36 @@ def _with_bad_normals_left_out(session: Session) -> Session:
         return session
     note = f"normals left out, for they disagree with the others: {kept}"
     return replace(session, found=again).noted(note)
+
+
+def _with_walk(session: Session) -> Session:
+    """Return the session with the camera's drift as a random walk, if that is far likelier."""
+    found = session.found
+    problem, model, sizes = found.problem, found.posterior.model, found.fit.sizes
+    whole = len(problem.ends) == 1 and bool((problem.seen.ranks == 6).all())
+    white = whitened(model, sizes)
+    left = white.errors - white.rows @ found.fit.mean
+    # Either the piecewise linear drift takes it up, or the noise does: white noise of sixteen poses
+    # has this correlation once in a thousand sessions
+    shows = found.outgrown("drift", 1.0) or serial_correlation(problem, left) > 0.3
+    if not (whole and shows):
+        return session
+    mode, costs = mode_of(model), {}
+    for walk in product((0.0, 0.4, 0.7, 0.9, 1.0), repeat=2):
+        walked = innovations(replace(problem, walk=walk), model)
+        mode = mode_of(walked, mode.z)
+        costs[walk] = fit(walked.subsampled(), model.sizes.at(mode.z)).cost + mode.z @ mode.z
+    walk = min(costs, key=costs.__getitem__)
+    if costs[0.0, 0.0] - costs[walk] < chi2_quantile(1 - MISFIT, len(walk)):
+        return session
+    again = estimate(replace(problem, walk=walk), found.places, found.effects, found.inliers)
+    return replace(session, found=again).noted(
+        Warn(
+            "what the camera sees drifts from pose to pose, as visual odometry does: each pose is "
+            "compared with those before it",
+            "check that camera and target do not move by themselves, or look at a fixed target",
+        )
+    )
 
 
 def _on_one_clock(session: Session) -> Session:
