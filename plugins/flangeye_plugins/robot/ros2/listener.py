@@ -213,7 +213,8 @@ class Listener(Device):
         return True
 
     def _require_forwards(self, sample: JointSample) -> None:
-        back = 1e-9 * (self._samples[-1].time_ns - sample.time_ns) if self._samples else 0.0
+        newest = self._samples[-1] if self._samples else sample
+        back = 1e-9 * (newest.time_ns - sample.time_ns)
         if back > self.stale:
             self._samples.clear()
             raise DeviceError(
