@@ -520,6 +520,14 @@ def test_a_word_of_the_controller_s_language_is_no_name(name: str, word: str) ->
         written(name, CalibratedPose(BENIGN), name=word)
 
 
+def test_a_controller_s_frames_are_numbered_from_0_to_999_and_the_first_is_1() -> None:
+    assert [NumberedParams(number=number).number for number in (0, 999)] == [0, 999]
+    assert NumberedParams().number == 1
+    for number in (-1, 1000):
+        with pytest.raises(ValueError, match="number"):
+            NumberedParams(number=number)
+
+
 def test_numbers_have_nine_places_and_zero_has_no_sign() -> None:
     assert rounded(1.23456789049) == 1.23456789
     assert fixed([-1e-12, -0.0, 1e-9, 1234.5]) == [
