@@ -13,8 +13,10 @@ import yaml
 
 from flangeye import types as t
 from flangeye.errors import StageError
+from flangeye.files.recording import OF_A_SIMULATOR
 from flangeye.models.cell import Cell
 from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.result import SIMULATED
 from flangeye.workflow.run import tables
 from flangeye.workflow.run.tables import (
     _csv,
@@ -107,15 +109,15 @@ def log_of(text: str | None, seen: list[t.Observation], clouds: bool = False) ->
     )  # fmt: skip
 
 
+UNUSED: Any = None
+TEXT = "title: a cell\nsteps: [acquire.simulated_cell, segment.flange, fit.rim, solve.robust]\n"
+
+
 @pytest.fixture
 def of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any recipe is that of a cell in which one arm moves."""
-    recipe = SimpleNamespace(context={Cell: SimpleNamespace(movers={"flange": None})})
+    recipe = SimpleNamespace(context={Cell: SimpleNamespace(movers={"flange": None})}, text=TEXT)
     monkeypatch.setattr(tables, "recipe_of_log", lambda *_: recipe)
-
-
-UNUSED: Any = None
-TEXT = "title: a cell\nsteps: [acquire.simulated_cell, segment.flange, fit.rim, solve.robust]\n"
 
 
 @pytest.mark.usefixtures("of_a_cell")
@@ -140,6 +142,16 @@ def test_a_table_of_the_arm_one_of_what_was_seen_and_a_recipe(tmp_path: Path, cl
         assert not (tmp_path / "clouds").exists()
         assert steps[1:] == ["solve.robust"]
     assert next(iter(steps[0])) == ("acquire.archive" if clouds else "acquire.centres")
+
+
+@pytest.mark.usefixtures("of_a_cell")
+def test_a_logs_own_models_and_a_simulation_are_told_beside_the_tables(tmp_path: Path) -> None:
+    log = log_of(TEXT.replace("a cell", "another"), [circle(k, [1e-8] * 3) for k in (10, 2)])
+    log.models, log.source = {"models/arm.yaml": b"name: arm\n"}, SimpleNamespace(simulated=True)
+    files = write_tables(log, tmp_path, UNUSED)
+    assert tmp_path / "models/arm.yaml" in files and files[-1] == tmp_path / "recipe.yaml"
+    assert (tmp_path / "models/arm.yaml").read_bytes() == b"name: arm\n"
+    assert (tmp_path / OF_A_SIMULATOR).read_text("utf-8") == f"{SIMULATED}.\n"
 
 
 def test_what_is_no_run_of_a_cell_has_no_tables(
