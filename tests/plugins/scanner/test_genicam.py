@@ -254,6 +254,6 @@ def test_a_scan_out_of_the_scanners_range_is_refused() -> None:
         scanner.expose()()
     assert str(error.value).startswith("Machine Vision Games Ltd. Viky 1: median distance 0.3")
     assert str(error.value).endswith(
-        "m, but phoxi-m sees 40.000 to 90.000 m; is the scanner's model right, and does it give "
-        "the unit that it states?"
+        "m, but phoxi-m sees 40.000 to 90.000 m; check the recipe's scanner model, and the unit in "
+        "which the driver gives points"
     )

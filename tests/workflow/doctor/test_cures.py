@@ -208,7 +208,7 @@ def test_centres_of_an_unknown_place_are_solved_by_what_a_refusal_names(tmp_path
         path = tmp_path / "recipe.yaml"
         path.write_text(yaml.safe_dump({**recipe, **more}))
         told.append(Runner(load_recipe(path, REGISTRY), REGISTRY, ArchivePath(tmp_path)).run())
-    assert "configuration: {place: unknown} finds it" in str(told[0].refused)
+    assert "configuration: {place: unknown} finds it" in str(told[0].advice)
     assert told[1].refused is None
     found = np.array(told[1].transforms["flange_T_target"].matrix)[:3, 3]
     assert found == pytest.approx(-offset, abs=1e-3)
