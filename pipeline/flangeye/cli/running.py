@@ -173,10 +173,12 @@ def _explain_refusal(
 
     wrong, advice = str(result.refused), result.advice
     passed = {step: found.passed for step, found in result.verifications.items()}
-    if passed and all(passed.values()):
-        names = [step.stage.name for step in recipe.steps]
-        last = max(i for i, name in enumerate(names) if name.startswith("verify."))
-        again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {names[last + 1]}"
+    names = [step.stage.name for step in recipe.steps]
+    verifies = [i for i, name in enumerate(names) if name.startswith("verify.")]
+    after = names[verifies[-1] + 1 :] if verifies else []
+    # A verification that refuses without a result leaves fewer results than there are verifications
+    if after and len(passed) == len(verifies) and all(passed.values()):
+        again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {after[0]}"
         steps = [*filter(None, (advice, with_urls(again)))]
         known = "this step measured it; the calibration before it was accepted"
         print_refusal(Console(), wrong, known, steps, "then")
