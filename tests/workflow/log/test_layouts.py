@@ -70,6 +70,17 @@ def test_the_flanges_are_in_base_once_solved(messages: Any) -> None:
     assert np.allclose(points_of(seen), toy.BASE_T_CAMERA.apply(first), atol=1e-3)
 
 
+def flanges_in_base(recorder: Recorder, camera: t.Transform, log: Path) -> list[np.ndarray]:
+    """End a run that found a camera there, and return the flanges' points that its log shows."""
+    estimate = t.TransformEstimate(camera, 1e-8 * np.eye(6), np.zeros(3))
+    recorder.flangeye_stage_finished("3.solve.toy", None, t.HandEye(estimate, (), "toy"), 0.1)
+    recorder.flangeye_run_finished({})
+    with log.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        logged = list(reader.iter_decoded_messages(topics=["/base/flanges"], log_time_order=False))
+    return [points_of(message) for _, _, _, message in logged]
+
+
 def test_what_a_camera_on_the_arm_sees_is_in_base_by_the_arm_s_pose(tmp_path: Path) -> None:
     places = [t.Transform(t.BASE, t.FLANGE, rigid(rotation_from_rpy(0.1 * k, 0.0, 1.0), [k, 0, 1]))
               for k in (0.0, 1.0)]  # fmt: skip
@@ -81,13 +92,7 @@ def test_what_a_camera_on_the_arm_sees_is_in_base_by_the_arm_s_pose(tmp_path: Pa
         recorder.flangeye_captured("0.acquire", t.Capture(name, cloud, t.by_frame(pose)), 0.1)
         seen = t.FlangeCloud(cloud, np.zeros(3), np.array([0.0, 0.0, -1.0]))
         recorder.flangeye_stage_finished("1.segment.toy", name, seen, 0.1)
-    estimate = t.TransformEstimate(carried, 1e-8 * np.eye(6), np.zeros(3))
-    recorder.flangeye_stage_finished("3.solve.toy", None, t.HandEye(estimate, (), "toy"), 0.1)
-    recorder.flangeye_run_finished({})
-    with (tmp_path / "run.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        logged = list(reader.iter_decoded_messages(topics=["/base/flanges"], log_time_order=False))
-    shown = [points_of(message) for _, _, _, message in logged]
+    shown = flanges_in_base(recorder, carried, tmp_path / "run.mcap")
     for points, pose in zip(shown, places, strict=True):
         np.testing.assert_allclose(points, (pose @ carried).apply(xyz), atol=1e-6)
 
@@ -99,13 +104,8 @@ def test_of_each_flange_in_base_four_thousand_points_are_shown(tmp_path: Path) -
         cloud, name = t.PointCloud(t.CAMERA, np.ones((points, 3), np.float32)), str(points)
         seen = t.FlangeCloud(cloud, np.zeros(3), np.array([0.0, 0.0, -1.0]))
         recorder.flangeye_stage_finished("1.segment.toy", name, seen, 0.1)
-    estimate = t.TransformEstimate(place, 1e-8 * np.eye(6), np.zeros(3))
-    recorder.flangeye_stage_finished("3.solve.toy", None, t.HandEye(estimate, (), "toy"), 0.1)
-    recorder.flangeye_run_finished({})
-    with (tmp_path / "run.mcap").open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        logged = list(reader.iter_decoded_messages(topics=["/base/flanges"], log_time_order=False))
-    assert [len(points_of(message)) for _, _, _, message in logged] == [4_000, 2_001, 4_000]
+    shown = flanges_in_base(recorder, place, tmp_path / "run.mcap")
+    assert [len(points) for points in shown] == [4_000, 2_001, 4_000]
 
 
 def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path: Path) -> None:
