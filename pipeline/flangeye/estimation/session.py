@@ -337,14 +337,14 @@ def _with_bad_normals_left_out(session: Session) -> Session:
 def _with_walk(session: Session) -> Session:
     """Return the session with the camera's drift as a random walk, if that is far likelier."""
     found = session.found
-    problem, model, sizes = found.problem, found.posterior.model, found.fit.sizes
-    whole = len(problem.ends) == 1 and bool((problem.seen.ranks == 6).all())
-    white = whitened(model, sizes)
+    problem, model = found.problem, found.posterior.model
+    if len(problem.ends) > 1 or (problem.seen.ranks < 6).any():
+        return session
+    white = whitened(model, found.fit.sizes)
     left = white.errors - white.rows @ found.fit.mean
     # Either the piecewise linear drift takes it up, or the noise does: white noise of sixteen poses
     # has this correlation once in a thousand sessions
-    shows = found.outgrown("drift", 1.0) or serial_correlation(problem, left) > 0.3
-    if not (whole and shows):
+    if not (found.outgrown("drift", 1.0) or serial_correlation(problem, left) > 0.3):
         return session
     mode, costs = mode_of(model), {}
     for walk in product((0.0, 0.4, 0.7, 0.9, 1.0), repeat=2):
