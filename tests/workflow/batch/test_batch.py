@@ -331,7 +331,8 @@ def test_files_for_tls_go_together_and_exist(batch: Callable[..., Any], tmp_path
 
 
 def test_the_local_cluster_keeps_few_messages_and_speaks_to_nobody_without_its_key() -> None:
-    from distributed import Client
+    from distributed import Security
+    from distributed.comm import connect
 
     from flangeye.workflow.batch.cluster import local_client
 
@@ -342,7 +343,7 @@ def test_the_local_cluster_keeps_few_messages_and_speaks_to_nobody_without_its_k
         address = client.scheduler.address
         assert address.startswith("tls://127.0.0.1:")
         assert client.submit(os.getpid).result(PATIENCE) > 0
-        with pytest.raises((OSError, TypeError)):
-            Client(address, timeout=1)
-        with pytest.raises(OSError):
-            Client(address.replace("tls", "tcp"), timeout=1)
+        for stranger, scheme in ((Security(), "tcp"), (Security.temporary(), "tls")):
+            own = stranger.get_connection_args("client")
+            with pytest.raises(OSError):
+                client.sync(connect, address.replace("tls", scheme), timeout=1, **own)
