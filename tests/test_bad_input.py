@@ -137,7 +137,7 @@ def test_a_disk_that_is_full(tmp_path: Path, ancorasir: Path) -> None:
     )  # fmt: skip
     assert told.returncode == 2
     assert [x for x in told.stderr.splitlines() if x][-3:] == [
-        "what was gathered is in full/run.mcap; flangeye report full shows it",
+        "the captures recorded so far are in full/run.mcap; flangeye report full shows it",
         "with other parameters: flangeye run aubo-i5_phoxi-s_archive --from full/run.mcap --at "
         "fit.rim --set PATH=VALUE (to do segment.flange again, record with --set log.clouds=full)",
         "error: full/run.mcap: cannot be written: File too large; what was written so far can be "

@@ -86,7 +86,7 @@ def test_a_recipe_runs_no_program(
     driver = f"{{model: phoxi-m, driver: {{azure_kinect: {{python: {path}}}}}}}"
     (tmp_path / "r.yaml").write_text(RECIPE.format(scanner=driver, sample=SAMPLE))
     said = one_line(flangeye("run", "r.yaml", "--out", "o"))
-    assert said.startswith("r.yaml:3: scanner.driver.azure_kinect.python: is the name of an entry")
+    assert said.startswith("r.yaml:3: scanner.driver.azure_kinect.python: must be the name of an")
     assert not (tmp_path / "PWNED").exists()
 
 
@@ -96,7 +96,7 @@ def test_a_program_of_the_current_folder_is_not_found_by_its_name(
     evil(tmp_path, "evil.sh")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with pytest.raises(DeviceError, match=r"this machine names no 'evil.sh'"):
+    with pytest.raises(DeviceError, match=r"this machine's settings have no entry 'evil.sh'"):
         scanner_azure_kinect(None, AzureKinectParams(python="evil.sh"))
     assert not (tmp_path / "PWNED").exists()
 
@@ -449,9 +449,9 @@ def test_a_log_killed_before_its_first_message_says_so(
     for length in (0, 5, 8, 30, 200):
         (tmp_path / "early.mcap").write_bytes(whole[:length])
         code, out, _ = flangeye("show", "early.mcap")
-        assert (code, "nothing was gathered yet" in out) == (0, True), length
+        assert (code, "no capture was recorded" in out) == (0, True), length
         for words in (("report", "early.mcap"), ("doctor", "early.mcap")):
-            assert "nothing was gathered yet" in one_line(flangeye(*words))
+            assert "no capture was recorded" in one_line(flangeye(*words))
     (tmp_path / "other.mcap").write_bytes(b"not a log at all")
     assert "other.mcap: is not an MCAP file" in one_line(flangeye("show", "other.mcap"))
 
@@ -479,7 +479,7 @@ def test_a_folder_in_which_anything_was_recorded_is_kept(
     code, _, err = flangeye("run", "toy.yaml", "--out", "kept", "--set", "log.clouds=full")
     assert code == 2
     assert len(read_run(tmp_path / "kept" / "run.mcap").poses) == 6
-    assert "what was gathered is in kept/run.mcap" in err
+    assert "the captures recorded so far are in kept/run.mcap" in err
     assert "flangeye run toy.yaml --from kept/run.mcap --at segment.toy --set PATH=VALUE" in err
 
 

@@ -433,7 +433,7 @@ Kind = Literal["programs", "libraries"]
 def _name(value: Any) -> str:
     if not isinstance(value, str) or not re.fullmatch(r"\w[\w.-]*", value, re.ASCII):
         raise ValueError(
-            "is the name of an entry of this machine's settings, never a path: a recipe may not "
+            "must be the name of an entry in this machine's settings, not a path: a recipe may not "
             "choose programs or libraries (flangeye's documentation: what a recipe can open)"
         )
     return value
@@ -477,7 +477,8 @@ def require_named(kind: Kind, name: str, asker: str) -> Path:
     if path is None:
         known = ", ".join(sorted(_entries(kind))) or "none"
         raise DeviceError(
-            f"{asker}: this machine names no '{name}' (it names: {known}); a recipe may not "
+            f"{asker}: this machine's settings have no entry '{name}' (entries: {known}); a recipe "
+            f"may not "
             f'choose programs or libraries: write {name} = "/its/path" under [{kind}] in '
             f"{settings_file()}"
         )
@@ -492,5 +493,5 @@ def _entries(kind: Kind) -> dict[str, str]:
     except (OSError, ValueError) as error:
         raise DeviceError(f"{settings_file()}: cannot be read: {error}") from None
     if not isinstance(table, dict):
-        raise DeviceError(f"{settings_file()}: [{kind}] is a table of names and paths")
+        raise DeviceError(f"{settings_file()}: [{kind}] must be a table of names and paths")
     return table

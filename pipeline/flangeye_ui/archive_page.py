@@ -122,7 +122,7 @@ def link(project: Project, path: Path) -> None:
 
 
 class Scrubber:
-    """A log, capture by capture."""
+    """Panel that shows a log one capture at a time."""
 
     def __init__(self, project: Project) -> None:
         self._project = project

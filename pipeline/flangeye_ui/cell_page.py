@@ -81,7 +81,7 @@ class Form:
     def verdict(self) -> None:
         """Show whether the recipe can run, and everything that is wrong with it."""
         _, mistakes = self._project.check()
-        count = f"{len(mistakes)} thing{'s' * (len(mistakes) > 1)} to mend in the recipe."
+        count = f"{len(mistakes)} mistake{'s' * (len(mistakes) > 1)} in the recipe."
         self._bar.say(count if mistakes else "The recipe is valid.")
         self._next.set_enabled(not mistakes)
         self._bar.simulated.set_visibility(self._project.simulated)
@@ -484,8 +484,11 @@ IMPORTED: Mapping[str, Boxes] = {
         "standard": ("Plate", lambda label: ui.select(_standards(), label=label)),
     },
     "scanner": {
-        "near": ("Nearest that it measures, such as 300 mm", ui.input),
-        "far": ("Farthest, such as 900 mm; archives need no more", ui.input),
+        "near": ("Minimum working distance, such as 300 mm", ui.input),
+        "far": (
+            "Maximum working distance, such as 900 mm (recordings need nothing below)",
+            ui.input,
+        ),
         "principle": ("Principle", _principles),
         "pixels": ("Columns and rows, such as 1032, 772", ui.input),
         "field": ("Field of view, such as 60 deg, 45 deg", ui.input),

@@ -50,8 +50,8 @@ class TouchBox:
         self._run = str(run.relative_to(project.folder))
         self._stage = project.registry.stages["verify.touch"]
         ui.label(
-            "Choose a corner that the scanner sees, jog a tip onto it, and compare. Three points "
-            "at different places and heights say most."
+            "Choose a corner that the scanner sees, jog a tip onto it, and compare. Use at least "
+            "three points at different places and heights."
         ).classes("note")
         with ui.row().classes("w-full gap-x-4"):
             self._boxes = {
@@ -295,7 +295,7 @@ def _line_of(project: Project, fix: str) -> dict[str, Any] | None:
 def _apply(project: Project, line: dict[str, Any]) -> None:
     for name, params in line.items():
         project.write_line(name, params)
-    ui.notify("Written into the recipe. Scan again to see what it does.")
+    ui.notify("Written into the recipe. Scan again to see the effect.")
 
 
 def warnings_of(facts: Facts) -> list[str]:

@@ -56,10 +56,10 @@ class RunPanel:
                 "The arm moves its flange from pose to pose before the scanner. Keep people out of "
                 "its workspace. Starting asks for a code that the terminal shows."
                 if self._moves
-                else "Others move the arm, by hand or by a program. A scan is taken where it "
-                "stands, and the next one when it has moved on and stands again."
+                else "Others move the arm, by hand or by a program. One scan is taken "
+                "each time the arm comes to rest at a new pose."
                 if self._live
-                else "No arm moves. Each scan is shown when it arrives, with what became of it."
+                else "No arm moves. Each scan is shown when it arrives, with its outcome."
             )
             ui.label(before).classes("col-12 col-md what")
         self._during = ui.column().classes("w-full gap-3")

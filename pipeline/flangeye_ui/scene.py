@@ -186,11 +186,11 @@ class Scene3D(ui.scene):
             ui.label(f"{scale}axes: {1e3 * BASE_AXES:.0f} mm; drag to turn").classes("note")
 
     def wipe(self) -> None:
-        """Take everything away but the axes."""
+        """Remove everything except the axes."""
         self.delete_objects(lambda each: each.id not in self._stays)
 
     def fit(self) -> None:
-        """Take the size of the column, after it was hidden."""
+        """Resize the scene to its column, which has no size while hidden."""
         self.run_method("resize")
 
     def frame(self, places: Floats) -> None:

@@ -47,7 +47,7 @@ def _show(project: Project, run: Path, facts: Facts, bar: ActionBar) -> None:
         return
     told = {stage.name.partition(".")[2]: stage.summary for stage in formats}
     Systems(project, run, {name: (told[name], file) for name, file in files.items()}, bar)
-    with ui.expansion("Certificate: who, where and how warm, and what it says").classes(
+    with ui.expansion("Certificate: operator, place, temperatures, and preview").classes(
         "w-full"
     ) as x:
         CertificateForm(project, run, facts, x)
@@ -70,7 +70,7 @@ class Systems:
                 box = ui.input("Search your system", on_change=lambda e: self._search(e.value))
                 box.classes("w-full").props("outlined dense clearable autofocus")
                 box.on("keydown.enter", self._first)
-                self._none = ui.label("No name has these words.").props('role="status"')
+                self._none = ui.label("No system's name has these words.").props('role="status"')
                 listed = ui.list().props('bordered separator role="group" aria-label="Systems"')
                 with listed.classes("w-full systems"):
                     self._items = {name: self._item(name) for name in files}

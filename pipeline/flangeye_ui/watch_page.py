@@ -105,7 +105,7 @@ class Watch:
         ui.timer(0.25, self._look)
 
     async def _choose(self) -> None:
-        """Offer new scans for a calibration; of a live one, such as the cell takes now."""
+        """Offer the ways to check a calibration: recorded scans, or a live cell's new ones."""
         run = self._project.folder / "runs" / self._which.value
         try:
             self._recipe = await asyncio.to_thread(live_recipe, self._project, run)
@@ -211,7 +211,7 @@ def live_recipe(project: Project, run: Path) -> Recipe | None:
 
 
 def other_seed(run: Path) -> list[str]:
-    """Return the words by which an emulated scanner takes other scans than those of a run."""
+    """Return command-line words that give an emulated scanner another seed than a run's."""
     path = run / "recipe.resolved.yaml"
     match parse_yaml(read_text(path), str(path)).data:
         case {"scanner": {"driver": {"emulator": {"seed": int(seed)}}}}:

@@ -224,7 +224,9 @@ class LoopbackScanner(OpenScanner):
     def _require_present(self) -> None:
         after = self._params.lost_after
         if after is not None and self._count >= after:
-            raise DeviceError(f"{self.name}: gone after {after} exposures, as lost_after says")
+            raise DeviceError(
+                f"{self.name}: disconnected after {after} exposures, as lost_after states"
+            )
 
     def _stances(self) -> list[TrueStance]:
         """Return the arm's true stances at even times over the exposure."""

@@ -13,7 +13,7 @@ class AsLaidParams(LaidParams):
     """Parameters of ``scan.as_laid`` and ``seam.misplanned``."""
 
     def seam(self) -> tuple[Floats, Floats, float | None]:
-        """Return the true seam (N, 3) its opening (3,), in base, and its half angle."""
+        """Return the true seam (N, 3) and its opening (3,) in base, and its half angle."""
         (seam,) = load_workpiece(self.workpiece).seams.values()
         pose = self.base_T_part
         points = _dense(seam.points) @ pose[:3, :3].T + pose[:3, 3]

@@ -160,7 +160,7 @@ def _summary_lines(found: Calibration, measured: bool) -> list[str]:
     if found.lateral is None or found.axial is None:
         return [*lines, "stiffness  not known: the arm measures no force"]
     stiffness = f"{found.lateral * 1e-3:.2f} N/mm across, {found.axial * 1e-3:.2f} N/mm along"
-    kept = "" if measured else ", as it was: the arm measures no force"
+    kept = "" if measured else ", unchanged: the arm measures no force"
     return [*lines, f"stiffness  {stiffness}{kept}"]
 
 
@@ -252,7 +252,7 @@ class HandGuide:
         feels = Interpreter(finger.model_copy(update={"calibration": calibration}))
         poses, displaced = [], []
         for attitude in ATTITUDES:
-            self._ask(f"Bring the tip into the mark, hardly pressing, the tool {attitude}")
+            self._ask(f"Bring the tip into the mark with hardly any pressure, the tool {attitude}")
             readings = self._look()
             felt = [feels.feel(reading, 0).displacement for reading in readings]
             if felt:
@@ -264,7 +264,7 @@ class HandGuide:
         """Return the position of the torch's end."""
         poses = []
         for attitude in ATTITUDES:
-            self._ask(f"Bring the torch's end to the mark, not pressing, the tool {attitude}")
+            self._ask(f"Bring the torch's end to the mark without pressure, the tool {attitude}")
             poses.append(self._stands())
         return pivot("torch", poses)
 
@@ -303,7 +303,7 @@ def summary_lines(found: ToolPoints) -> list[str]:
     return [
         _line("tip", found.tip),
         _line("torch", found.torch),
-        "check      bring either to a point that the scanner saw, X,Y,Z in a calibration's RUN:",
+        "check      touch a point X,Y,Z that the scanner measured, with the calibration's RUN:",
         f"           flangeye touch RUN --seen X,Y,Z --tip {tip}",
         f"           flangeye touch RUN --seen X,Y,Z --tip {torch}",
     ]
@@ -314,5 +314,5 @@ def _line(name: str, found: Pivot) -> str:
     sigma = ", ".join(f"{x * 1e3:.2f}" for x in np.sqrt(np.diag(found.covariance)))
     return (
         f"{name:<10} at ({point}) mm in the flange, standard deviations ({sigma}) mm, "
-        f"{found.rms * 1e3:.2f} mm unexplained"
+        f"{found.rms * 1e3:.2f} mm rms residual"
     )

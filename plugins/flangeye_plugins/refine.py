@@ -190,7 +190,7 @@ def refine_arm(
     )
     found = answered(session, Options(), calibration.method)
     kept = (
-        "the arm's parameters are left out, for correcting them is not expected to help"
+        "the arm's parameters are not corrected, because no smaller error is expected from it"
         if found.corrected is None
         else "the arm's parameters are corrected"
     )
@@ -212,7 +212,7 @@ def _identifiability(told: ArmParameters, session: Session) -> str:
         )
     return (
         f"the poses identify none of the arm's {count} parameters singly{one}, and {combined} of "
-        "them: the correction predicts at poses like these, and says nothing of any one joint"
+        "them: the correction is valid at similar poses, and gives no value for any single joint"
     )
 
 
@@ -244,8 +244,8 @@ def _ways(told: ArmParameters) -> list[str]:
     ways = "any number of" if np.isinf(told.ways) else told.ways
     return [
         "the recordings have no joint angles, and the arm may have reached the poses in "
-        f"{ways} ways that fit alike: what they do not agree on is not identified, and the "
-        "corrected arm is that of the best of them; record the joint angles with the poses"
+        f"{ways} ways that fit equally: parameters on which these disagree are not identified, and "
+        f"the correction is that of the best one; record the joint angles with the poses"
     ]
 
 

@@ -63,8 +63,9 @@ def view_shown(arm: Arm, scanner: ScannerModel, params: ShownParams) -> Floats:
     widest = 0.6
     if apart > widest:
         raise StageError(
-            f"view.shown: one of the flanges looks {np.degrees(apart):.0f} deg away from the "
-            f"others' middle, allowed {np.degrees(widest):.0f} deg; show poses that face the "
+            f"view.shown: in one pose the flange faces {np.degrees(apart):.0f} deg away from the "
+            f"others' mean direction, allowed {np.degrees(widest):.0f} deg; show poses that face "
+            f"the "
             "scanner"
         )
     middle = places.mean(axis=0)

@@ -36,9 +36,9 @@ def test_the_lists_name_every_model() -> None:
     [
         (("new-robot", "mine"), "joint 1: was not answered; give --joint or --urdf"),
         (("new-scanner", "acme"),
-         "nearest it sees, for example 300 mm: was not answered; give --near"),
+         "minimum working distance, for example 300 mm: was not answered; give --near"),
         (("new-scanner", "acme", "--near", "300 mm"),
-         "farthest it sees, for example 900 mm: was not answered; give --far"),
+         "maximum working distance, for example 900 mm: was not answered; give --far"),
     ],
 )  # fmt: skip
 def test_who_asks_where_nobody_answers_says_what_to_give_instead(

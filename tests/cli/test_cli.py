@@ -195,7 +195,7 @@ def test_a_folder_is_kept_once_something_was_gathered(
     assert code == 2
     assert (
         err.splitlines()[0]
-        == "what was gathered is in kept/run.mcap; flangeye report kept shows it"
+        == "the captures recorded so far are in kept/run.mcap; flangeye report kept shows it"
     )
     assert flangeye("show", "kept/run.mcap")[0] == 0
 
@@ -256,7 +256,7 @@ def test_ctrl_c_keeps_what_was_gathered(
         code, _, err = flangeye("run", toy_recipe, "--out", "a")
     assert code == 130
     assert err.splitlines()[-3:] == [
-        "what was gathered is in a/run.mcap; flangeye report a shows it",
+        "the captures recorded so far are in a/run.mcap; flangeye report a shows it",
         f"with other parameters: flangeye run {toy_recipe} --from a/run.mcap --at fit.toy --set "
         "PATH=VALUE (to do segment.toy again, record with --set log.clouds=full)",
         "error: stopped by Ctrl-C",

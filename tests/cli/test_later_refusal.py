@@ -33,7 +33,7 @@ def test_a_seam_that_is_not_there_is_no_fault_of_the_calibration(
     code, out, _ = command("run", tmp_path / "seam.yaml", "--out", tmp_path / "run")
     last = out[out.index("What is wrong") :]
     assert code == 1 and "seam.joint: no vee joint within" in last
-    assert "the calibration before it was accepted" in last and "doctor" not in last
+    assert "the calibration itself passed its verification" in last and "doctor" not in last
     assert "Next step         name the joint that is there (joint)" in last
     assert "--at scan.file" in " ".join(last[last.index("then ") :].split())
 

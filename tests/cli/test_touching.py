@@ -40,7 +40,7 @@ def test_the_step_it_writes_says_what_it_said(
     assert (
         said[0].endswith("predicted is off by (+0.80, -0.00, +0.00), 0.80 mm") or "0.80" in said[0]
     )
-    assert said[-1].startswith("off by 0.80 mm at most; ")
+    assert said[-1].startswith("largest error 0.80 mm; ")
     (step,) = yaml.safe_load(out.read_text())
     found = verify_touch(calibration, TouchParams(**step["verify.touch"]))
     assert found.figures["max"] == pytest.approx(0.8e-3, abs=2e-5)

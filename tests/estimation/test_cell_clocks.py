@@ -77,7 +77,7 @@ def solved(
     """Return the squared distance of every transform, of six, and what is told of clocks."""
     cell = CELL if axis is None else carried_by(axis)
     found = solve_cell(seen(delays, seed, recorded, axis), cell, RobustParams())
-    told = [n for n in found.notes if "at the poses" in n]
+    told = [n for n in found.notes if "the arms reached" in n]
     return squares_at(found, PLACES), told
 
 
@@ -115,13 +115,13 @@ def test_a_delay_beyond_what_was_recorded_is_refused() -> None:
 def test_arms_that_stood_still_have_no_clock() -> None:
     still = [replace(o, motion=None) for o in seen({"left": 0.0, "right": 0.0})]
     found = solve_cell(still, CELL, RobustParams())
-    assert not [note for note in found.notes if "the arms were" in note]
+    assert not [note for note in found.notes if "time offset" in note]
 
 
 def test_a_camera_whose_sightings_all_disagree_is_named() -> None:
     told = (
         r"fit one calibration to \S+ mm and \S+ deg only, worst those of marker by right; .*"
-        r"\(join: clock_offset, where the clock of right is another\)"
+        r"\(join: clock_offset, if right has another clock\)"
     )
     with pytest.raises(CalibrationRefused, match=told):
         solved({"left": 0.0, "right": 0.5})

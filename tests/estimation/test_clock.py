@@ -23,7 +23,7 @@ def solved(name, kind, delay, seed, n=24):
     robot = ROBOT if made.configuration.name == "eye-on-arm" else None
     found = cells.solved(made, robot)
     square = squares(found, made.truth)[0]
-    return square, [note for note in found.notes if "the arms were at the poses" in note]
+    return square, [note for note in found.notes if "the arms reached the recorded poses" in note]
 
 
 def told(note):

@@ -101,8 +101,8 @@ def test_two_steps_need_an_arm_that_rests() -> None:
     with pytest.raises(CalibrationRefused) as error:
         solve("two_steps", made)
     assert str(error.value) == (
-        "the second arm stands still at 1 poses at most, and 3 are needed at which only the first "
-        "moves; record such poses, or use solve.robust, which needs none"
+        "the second arm stands still at no more than 1 poses; 3 poses at which only "
+        "the first arm moves are needed; record such poses, or use solve.robust, which needs none"
     )
 
 
@@ -127,8 +127,8 @@ def test_motions_of_half_a_turn_alone_are_refused() -> None:
     with pytest.raises(CalibrationRefused) as error:
         motions_of(carried, np.array([np.eye(4), half]))
     assert str(error.value) == (
-        "all 1 motions between poses turn by 180 deg or more: the axis of half a turn may point "
-        "either way; add poses in between"
+        "all 1 motions between poses turn by 180 deg or more: the sign of the axis of a half "
+        "turn is not determined; add poses in between"
     )
     assert rng
 

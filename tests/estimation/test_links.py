@@ -152,7 +152,7 @@ def test_the_clock_of_a_camera_on_a_link_is_found_by_the_arms_joints() -> None:
     cell, _, places = session("steps.0.sightings=8")
     delays = {"forearm": 0.06, "wall": -0.03}
     found = solve_cell(passing(delays, places), cell, RobustParams())
-    (note,) = [note for note in found.notes if "the arms were at the poses" in note]
+    (note,) = [note for note in found.notes if "the arms reached the recorded poses" in note]
     told = re.findall(r"([\d.]+) \+- ([\d.]+) ms (after|before) the times that (\w+) gives", note)
     for delay, sigma, which, camera in told:
         signed = float(delay) * (1 if which == "after" else -1)

@@ -63,8 +63,8 @@ def test_parallel_axes_are_named() -> None:
     assert told.startswith("translation of the camera's pose is not observable from these poses: ")
     assert "the arm turned about one axis only, (" in told
     assert told.endswith(
-        "so that translation along it does not show; tilt it about another axis too, or, where it "
-        "has four joints, set unobservable: mark"
+        "so that translation along it is not observable; tilt it about another axis too, or, where "
+        "it has four joints, set unobservable: mark"
     )
 
 
@@ -185,7 +185,9 @@ def test_noise_that_is_not_stated_is_found() -> None:
     made = session(MARKER, rng, n=60, noise=Noise(arm_shift=5e-4))
     (note,) = solved(made).notes
     beyond = float(
-        note.removeprefix("estimated noise of each pose in addition to its fit's: ").split(" mm")[0]
+        note.removeprefix(
+            "estimated noise of each pose, in addition to the noise of its fit: "
+        ).split(" mm")[0]
     )
     assert 0.4 < beyond < 0.65
 

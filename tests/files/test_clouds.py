@@ -393,7 +393,7 @@ def test_a_small_stream_cannot_promise_much(tmp_path: Path) -> None:
     header = PACKED[: STREAM - 8].replace(b" 50\n", f" {n}\n".encode())
     sizes = (40).to_bytes(4, "little") + (12 * n).to_bytes(4, "little")
     path.write_bytes(header + sizes + bytes(40))
-    with pytest.raises(StageError, match=r"40 compressed bytes cannot stand for 1200000000$"):
+    with pytest.raises(StageError, match=r"40 compressed bytes cannot expand to 1200000000$"):
         check_cloud_file(path)
 
 

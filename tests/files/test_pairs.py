@@ -1,5 +1,6 @@
 """Names belong together by what they share; where the sets differ, nothing is paired."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from flangeye.errors import StageError
 from flangeye.files.scans import Poses, in_order, natural, numbers_of, partners, scans_in, scans_of
+from flangeye.types import Warn
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
@@ -59,6 +61,33 @@ def test_sets_that_differ_are_refused(poses: str, others: str, message: str) -> 
     with pytest.raises(StageError, match="^here: [0-9]+ poses") as error:
         partners("here", poses.split(), others.split())
     assert str(error.value).endswith(message)
+
+
+def test_names_without_a_common_number_are_paired_in_order_with_a_warning(tmp_path: Path) -> None:
+    place(tmp_path, *(f"frame_{k}.ply" for k in range(98, 103)))
+    poses = Poses("p.csv", 5, names=[f"p{k}" for k in range(5)], ranked=True)
+    found, (note,) = scans_of(tmp_path, poses)
+    assert [at[0].stem for at in found] == [f"frame_{k}" for k in range(98, 103)]
+    assert isinstance(note, Warn)
+    assert note == (
+        "poses and scans have no number in common, so they are paired in order: p0 with frame_98, "
+        "…, p4 with frame_102"
+    )
+    with pytest.raises(StageError, match="differ in their numbers"):
+        scans_of(tmp_path, replace(poses, ranked=False))
+
+
+@pytest.mark.parametrize("first", [-1, 1, 4, 90])
+def test_a_number_in_common_or_another_count_pairs_nothing_in_order(
+    tmp_path: Path, first: int
+) -> None:
+    """One lost scan and one lost pose look alike: then no order is safe."""
+    place(tmp_path, *(f"frame_{k}.ply" for k in range(abs(first), abs(first) + 5)))
+    names = [f"p{k}" for k in range(4 if first == 90 else 5)]
+    if first == -1:
+        names = ["left", *names[1:]]
+    with pytest.raises(StageError, match="differ in their numbers"):
+        scans_of(tmp_path, Poses("p.csv", len(names), names=names, ranked=True))
 
 
 def test_rows_without_names_say_with_what_they_were_paired() -> None:

@@ -53,7 +53,7 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(cell: Any) -> None:
     assert process.returncode == 130
     assert time.monotonic() - sent < 20
     assert err.splitlines()[-4:] == [
-        "what was gathered is in run/run.mcap; flangeye report run shows it",
+        "the captures recorded so far are in run/run.mcap; flangeye report run shows it",
         f"with other parameters: flangeye run {recipe} --from run/run.mcap --at fit.rim --set "
         "PATH=VALUE (to do segment.flange again, record with --set log.clouds=full)",
         "resume it: flangeye run --resume run --move",
@@ -163,7 +163,7 @@ def test_a_doubt_ends_the_run_and_nothing_gathered_is_lost(
 def test_a_scanner_that_is_lost_stops_the_arm(cell: Any) -> None:
     code, _, err = cell.run(cell.recipe(scanner="lost_after: 2"), "--move", "--out", "run")
     assert code == 2
-    assert "gone after 2 exposures" in err.splitlines()[-1]
+    assert "disconnected after 2 exposures" in err.splitlines()[-1]
     assert cell.captures("run") == ["0000", "0001"]
     assert cell.standing()
 

@@ -168,7 +168,7 @@ def test_a_link_needs_the_robots_model(registry: Any) -> None:
     )
     with pytest.raises(
         RecipeError,
-        match="where a link is follows from the arm's kinematics; name the robot's model",
+        match="a link's pose is computed by the arm's kinematics; name the robot's model",
     ):
         parse_recipe(text, "r.yaml", registry)
 
@@ -260,8 +260,8 @@ def test_a_link_is_where_its_joints_put_it(registry: Any) -> None:
     with pytest.raises(StageError) as error:
         cell_of(configuration, robot).graph([observation()])
     assert str(error.value) == (
-        "where link3 was at observation 7 follows from the joint angles of 'flange', and there "
-        "are none: record them, and name the robot's model in the recipe"
+        "where link3 was at observation 7 is computed from the joint angles of 'flange', which are "
+        "missing: record them, and name the robot's model in the recipe"
     )
 
 

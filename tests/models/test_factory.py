@@ -97,7 +97,7 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, text: Any, name: str, to
 
 
 def test_a_factory_calibration_is_a_urs(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="a factory calibration is a UR's; franka-panda has none"):
+    with pytest.raises(RecipeError, match="have a factory calibration; franka-panda has none"):
         as_built(load_model("robots", "franka-panda"), written(tmp_path, CONF))
     with pytest.raises(RecipeError, match=r"no such file; copy calibration.conf from the controll"):
         as_built(UR5E, tmp_path / "absent.conf")

@@ -162,7 +162,7 @@ def test_missing_meshes_matter_where_a_plan_needs_them(kuka: Path, tmp_path: Pat
     ("change", "words"),
     [
         (lambda t: re.sub("<mesh [^>]*>", '<sphere radius="0"/>', t),
-         "the <sphere> of link 'link_0' has a radius of 0 mm; give it one, or take the body away"),
+         "the <sphere> of link 'link_0' has a radius of 0 mm; give it a radius above zero, or remove the body"),
         (lambda t: t.replace('scale="0.001 0.001 0.001"', 'scale="1e400 1 1"', 1),
          'scale="1e400 1 1" is not three finite numbers'),
         (lambda t: re.sub("<collision>.*?</collision>", "", t), "no link of the arm has a coll"),
@@ -381,7 +381,7 @@ def test_eight_lines_for_a_kuka_and_an_unknown_scanner(kuka: Path, tmp_path: Pat
     [
         ("{urdf: a.urdf, factory: calibration.conf}", "a urdf brings its own calibration"),
         ("{urdf: a.urdf, model: ur5}", "either a model or a urdf, not both"),
-        ("{model: ur5, base: base_link}", "say where things are in a urdf; name it"),
+        ("{model: ur5, base: base_link}", "belong to a urdf; name the urdf too"),
         ("{urdf: a.urdf}", "robot.urdf: .*a.urdf: cannot be read"),
     ],
 )

@@ -197,7 +197,7 @@ def test_an_arm_that_moves_untold_is_noticed() -> None:
     robot = StandIn(pushed)
     with (
         watched(driver_of(robot), MODEL, LIMITS) as arm,
-        pytest.raises(DeviceError, match="the arm moves without a command from here"),
+        pytest.raises(DeviceError, match="the arm moves without a command of flangeye"),
     ):
         arm.wait()
 

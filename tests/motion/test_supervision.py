@@ -37,7 +37,7 @@ def test_an_arm_may_brake_for_its_time_and_no_longer(start: Any) -> None:
     braking = BRAKING
     watch = halted_at(start)
     assert not watch.judge(moving(start + braking))
-    with pytest.raises(SafetyFault, match="the arm moves without a command from here"):
+    with pytest.raises(SafetyFault, match="the arm moves without a command of flangeye"):
         watch.judge(moving(start + braking + 1_000_000))
 
 
@@ -61,7 +61,7 @@ def test_an_arm_that_stands_is_never_doubted() -> None:
 
 def test_who_else_moves_it_and_that_it_goes_on_is_said() -> None:
     watch = halted_at(SECOND)
-    with pytest.raises(SafetyFault, match="another program drives it and goes on; stop it"):
+    with pytest.raises(SafetyFault, match="another program drives it; stop that program"):
         watch.judge(moving(100 * SECOND))
 
 
@@ -86,7 +86,7 @@ def test_an_arm_that_is_found_moving_has_two_seconds_to_come_to_rest() -> None:
     watch = Supervisor(MODEL, LIMITS)
     assert not watch.judge(moving(5 * SECOND))
     assert not watch.judge(moving(7 * SECOND))
-    with pytest.raises(SafetyFault, match="the arm moves without a command from here"):
+    with pytest.raises(SafetyFault, match="the arm moves without a command of flangeye"):
         watch.judge(moving(7 * SECOND + 1))
 
 
@@ -246,7 +246,7 @@ def test_after_a_halt_there_is_no_way_to_be_beside_of() -> None:
     watch.halted()
     assert watch.leg is None
     assert not watch.judge(at(0.5, turned(AT_HOME.joints, j3=0.3), 1.0))
-    with pytest.raises(SafetyFault, match="without a command from here"):
+    with pytest.raises(SafetyFault, match="without a command of flangeye"):
         watch.judge(at(2.001, AT_HOME.joints, 1.0))
 
 
@@ -276,7 +276,7 @@ def test_who_is_led_may_move_and_has_never_arrived() -> None:
     watch.expect_servo()
     assert not watch.judge(at(9.0, AT_HOME.joints, 0.3))
     watch.halted()
-    with pytest.raises(SafetyFault, match="without a command from here"):
+    with pytest.raises(SafetyFault, match="without a command of flangeye"):
         watch.judge(at(11.001, AT_HOME.joints, 0.3))
 
 

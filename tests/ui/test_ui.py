@@ -164,7 +164,7 @@ def test_from_an_empty_folder_to_an_exported_file(browser: Any, served: Served) 
     page.get_by_text("What would make it better").wait_for()
     page.get_by_text("cells of the workspace; turned").wait_for(state="attached")
     go(page, "Use")
-    page.get_by_text("Certificate: who").click()
+    page.get_by_text("Certificate: operator").click()
     page.get_by_label("Who did it").fill("a person")
     page.get_by_role("button", name="Write the certificate").click()
     page.get_by_role("link", name="Open the certificate").wait_for()
@@ -284,7 +284,7 @@ def test_poses_that_cannot_be_reached_are_red(browser: Any, served: Served) -> N
 def test_a_recipe_that_is_wrong_opens_with_its_mistakes(browser: Any, served: Served) -> None:
     (served.folder / "cell.yaml").write_text(SMALL.replace("0.25", "quarter"))
     page = opened(browser, served)
-    page.get_by_text("to mend in the recipe.").wait_for()
+    page.get_by_text("in the recipe.").wait_for()
     page.locator(".q-field--error", has_text="resolution").get_by_text("quarter").wait_for()
     assert page.get_by_role("button", name="Next: check the poses").is_disabled()
     page.get_by_label("Search the settings").fill("noise")
@@ -392,8 +392,8 @@ def test_a_scanner_is_imported(browser: Any, served: Served) -> None:
     page.get_by_text("Import a scanner").click()
     page.get_by_label("Name of the scanner").fill("eye7")
     for label, value in (
-        ("Nearest that it measures", "400 mm"),
-        ("Farthest", "900 mm"),
+        ("Minimum working distance", "400 mm"),
+        ("Maximum working distance", "900 mm"),
         ("Columns and rows", "640, 480"),
         ("Field of view", "55 deg, 42 deg"),
         ("Noise of a pixel", "0.1 mm"),
@@ -841,7 +841,7 @@ def test_a_bar_of_the_chart_opens_the_scan_of_its_pose(
 def test_the_certificate_is_previewed(browser: Any, served: Served, finished: Path) -> None:
     page = opened(browser, served)
     page.goto(f"{page.url}use?run={finished.name}")
-    page.get_by_text("Certificate: who").click()
+    page.get_by_text("Certificate: operator").click()
     page.get_by_label("Where it was done").fill("Hall 7 <b>")
     page.get_by_label("Temperature of the air, °C").fill("21")
     page.get_by_label("Temperature of the air, °C").press("Tab")

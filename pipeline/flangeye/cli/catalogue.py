@@ -135,14 +135,14 @@ def new_scanner(  # noqa: PLR0913  one for each option
     columns, rows = pixels or (None, None)
     values = {
         "model": name,
-        "near": near or ask("nearest it sees, for example 300 mm", "give --near"),
-        "far": far or ask("farthest it sees, for example 900 mm", "give --far"),
+        "near": near or ask("minimum working distance, for example 300 mm", "give --near"),
+        "far": far or ask("maximum working distance, for example 900 mm", "give --far"),
         "principle": principle, "columns": columns, "rows": rows,
         "field_of_view": list(field) if field else None,
         "temporal_noise": noise, "calibration_error": error,
     }  # fmt: skip
     if principle or pixels or field or noise or error:
-        values |= {"maker": "", "source": "stated when the file was made"}
+        values |= {"maker": "", "source": "entered by the user with flangeye new-scanner"}
     say(write_scanner(path, values))
 
 

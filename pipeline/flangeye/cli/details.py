@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def print_details(console: Console, result: Result) -> None:
-    """Print the verdict, every figure, both answers, seam and weld, and the notes."""
+    """Print verdict, figures, the poses for reported and corrected arm, seam, weld and notes."""
     used = sum(o.used for o in result.observations)
     count = f"{used} of {len(result.observations)} captures used"
     lines = [result.title, f"{status_of(result)}: {count}"]
@@ -47,7 +47,7 @@ def print_details(console: Console, result: Result) -> None:
 
 
 def _hung(console: Console, line: str) -> str:
-    """Return one line, wrapped to a terminal's width; commands and lines for a file stay whole."""
+    """Return a line wrapped with a hanging indent; commands and lines of a file are not broken."""
     if line.startswith("  ->") or not console.is_terminal:
         return line.replace("\n", " ")
     return wrapped(console, line, 21 if line.startswith("  ") else 2)
@@ -114,13 +114,13 @@ def _over(held: HoldoutResult) -> str:
 
 
 def _answers(result: Result) -> list[str]:
-    """Return both answers, where an error of the arm was found."""
+    """Return the poses for reported and corrected arm; empty without a correction."""
     answers = result.answers
     if answers is None or answers.corrected is None:
         return []
-    lines = ["", "Two answers: use each pose only with its own arm model"]
+    lines = ["", "Two camera poses: use each only with the arm model that it was estimated for"]
     for name, answer in (
-        ("arm as it reports", answers.as_reported), ("arm corrected", answers.corrected)
+        ("arm as reported", answers.as_reported), ("arm corrected", answers.corrected)
     ):  # fmt: skip
         pose = np.array(next(iter(answer.transforms.values())).matrix)
         at = ", ".join(f"{x * 1e3:z.2f}" for x in pose[:3, 3])
@@ -226,7 +226,7 @@ def _state(log: RunLog) -> str:
     if log.complete:
         return "complete"
     if not log.gathered:
-        return "incomplete: the run ended early; nothing was gathered yet"
+        return "incomplete: the run ended early; no capture was recorded"
     return "incomplete: the run ended early; shown as far as it goes"
 
 

@@ -42,13 +42,14 @@ ANSWER_HELP = {
     "target-angle": "Unit of the target's angles: deg or rad.",
     "target-pose": "Direction of the target: camera_T_target or target_T_camera.",
     "reader": "Reader as written in a recipe; replaces the options above.",
-    "flange": "With --ros2: the flange's link, where no name says it.",
+    "flange": "With --ros2: link of the flange, if no link's name shows it.",
     "trajectory": "With --ros2: topic of the controller that moves the arm, or none.",
     "scans": "With --ros2: topic of clouds, depth images or images.",
     "trigger": "With --ros2: service that takes a scan, or none.",
     "view": "With --ros2: where the scanner, or a camera in hand's target, roughly stands: "
     "'620, 0, 980 mm'.",
-    "box": "With --ros2: the flange's box, centre; size: '450, 0, 300; 600, 600, 600 mm'.",
+    "box": "With --ros2: box that the flange may move in, centre; size: '450, 0, 300; 600, 600, "
+    "600 mm'.",
 }
 """Options of ``init`` that answer what a person is asked otherwise, with their help."""
 
@@ -88,6 +89,7 @@ def init(
     Inspects the folder or the running graph, and asks for what these do not show.
     """
     from flangeye.files.regular import write_whole
+    from flangeye.types.arrays import Warn, as_line
     from flangeye.workflow.recipe.draft import Questions
     from flangeye.workflow.recipe.load import load_recipe
 
@@ -116,7 +118,7 @@ def init(
             re.sub(r"^.*?: steps\.\d+\.fit\.", "--target ", str(error), flags=re.MULTILINE)
         ) from None
     for line in (*draft.told, *(f"assumed: {line}" for line in questions.assumed)):
-        say(line)
+        say(as_line(line) if isinstance(line, Warn) else line)
     say(f"{out}: ok, {len(checked.steps)} steps; next: flangeye run {out}")
 
 
@@ -141,7 +143,9 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
     # The scanner's range tells metres from millimetres; centimetres lie between, so they are tried
     in_cm = replace(draft, text=draft.text.replace("archive: {", "archive: {unit: cm, ", 1))
     if _seen(in_cm, survey.folder, out, registry, 1):
-        questions.assumed.append("unit of the clouds: cm, as in m or mm no scan shows the flange")
+        questions.assumed.append(
+            "unit of the clouds: cm, because no scan shows the flange when read in m or mm"
+        )
         return in_cm
     questions.given["target"] = None
     seen = "which target they show ('body: gripper.stl' for a tool by its mesh)"
@@ -150,7 +154,7 @@ def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry
 
 
 def _drafted(survey: FolderSurvey, out: Path, questions: Questions, registry: Registry) -> Draft:
-    """Return a draft; scans decide what the numbers of the arm's rotation mean, if nothing else.
+    """Return a draft; the scans decide the arm's rotation convention if nothing else shows it.
 
     Raises:
         FlangeyeError: As :func:`draft_recipe`.
@@ -172,9 +176,10 @@ def _drafted(survey: FolderSurvey, out: Path, questions: Questions, registry: Re
             raise
     else:
         unsure = any(line.startswith("rotation convention") for line in questions.assumed)
-        if not unsure or "fit." not in draft.text or questions.given["rotation"] not in unnamed:
+        rivals = unnamed if questions.given["rotation"] in unnamed else questions.rivals
+        if not unsure or "fit." not in draft.text or not rivals:
             return draft
-        found = _decided(unnamed, survey, out, anew, registry)
+        found = _decided(rivals, survey, out, anew, registry)
         if found is None:
             return draft
     questions.given, questions.likely = anew.given, anew.likely
@@ -185,7 +190,7 @@ def _drafted(survey: FolderSurvey, out: Path, questions: Questions, registry: Re
 def _decided(
     names: Sequence[str], survey: FolderSurvey, out: Path, questions: Questions, registry: Registry
 ) -> Draft | None:
-    """Return a draft with the convention of rotations that scans show; None if they show none.
+    """Return a draft with the rotation convention inferred from scans; None if not decided.
 
     Raises:
         FlangeyeError: As :func:`draft_recipe`.

@@ -86,10 +86,10 @@ def publish(
     run: LogFile,
     parent: Annotated[
         str | None,
-        typer.Option(help="The graph's frame that carries the camera; by default the recipe's."),
+        typer.Option(help="tf frame that carries the camera; by default the recipe's."),
     ] = None,
     child: Annotated[
-        str | None, typer.Option(help="The graph's frame of the camera; by default the recipe's.")
+        str | None, typer.Option(help="tf frame of the camera; by default the recipe's.")
     ] = None,
     camera: Camera = None,
     anyway: Anyway = False,
@@ -156,7 +156,7 @@ def _exported(
     stage = registry.stage(name)
     if stage not in registry.exports():
         raise StageError(
-            f"{name}: needs more of a run than the camera's pose; add it to the recipe"
+            f"{name}: needs more than the camera's pose; add it as a step to the recipe"
         )
     if camera and stage.params and "name" in stage.params.model_fields:
         values = [f"name={camera}", *values]  # else the files of all cameras have one name

@@ -32,8 +32,8 @@ def tactile_calibrate(
         bool,
         typer.Option(
             "--body",
-            help="Then find tip and torch in the flange, and how well: you bring each to a mark, "
-            "the tool in seven attitudes.",
+            help="Also calibrate tip and torch in the flange frame, with covariance: you "
+            "bring each to a mark with the tool in seven orientations.",
         ),
     ] = False,
 ) -> None:

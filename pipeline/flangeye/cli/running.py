@@ -180,7 +180,7 @@ def _explain_refusal(
     if after and len(passed) == len(verifies) and all(passed.values()):
         again = f"flangeye run {quote(called)} --from {quote(str(log))} --at {after[0]}"
         steps = [*filter(None, (advice, with_urls(again)))]
-        known = "this step measured it; the calibration before it was accepted"
+        known = "this step's own measurement; the calibration itself passed its verification"
         print_refusal(Console(), wrong, known, steps, "then")
         return
     findings, known = _findings(log, registry, recipe)
@@ -245,7 +245,7 @@ def _point(
     log = read_run(source)
     say_notes(log.notes)
     if not log.gathered:
-        raise StageError(f"{log.path}: nothing was gathered in it; there is nothing to run on")
+        raise StageError(f"{log.path}: holds no captures, so there is nothing to run on")
     return restart_at(log, recipe, at, leave_out)
 
 
@@ -283,7 +283,7 @@ def _say_how_to_go_on(recipe: Recipe, called: str, folder: RunFolder, start: Sta
 
     seen = f"flangeye report {quote(str(folder.path))} shows it"
     lines = [
-        f"what was gathered is in {folder.log}; {seen}",
+        f"the captures recorded so far are in {folder.log}; {seen}",
         f"with other parameters: {restart_hint(recipe, called, folder.log)}",
     ]
     if resumable(recipe):

@@ -100,7 +100,7 @@ def _camera_of_several(result: Result) -> str:
 def print_refusal(
     console: Console, wrong: str, known: str, next_steps: Collection[str], joined: str = "or"
 ) -> None:
-    """Print what is wrong, how it is known, and what to do next: two steps are joined by a word."""
+    """Print what is wrong, how it is known, and one or two next steps with ``joined`` between."""
     write(console, wrapped(console, f"What is wrong     {wrong}", 18), "red")
     write(console, wrapped(console, f"How it is known   {known}", 18))
     for name, step in zip(("Next step", joined), next_steps, strict=False):
@@ -173,7 +173,7 @@ class RunProgress:
 
     @hookimpl
     def flangeye_capture_rejected(self, rejection: Rejection) -> None:
-        """Print which capture was rejected, and why; of those that share a reason, the first."""
+        """Print the first capture rejected for each reason, with the reason."""
         alike = self._rejected.setdefault(rejection.kind, [])
         if not alike:
             write(self._console, wrapped(self._console, f"rejected {rejection.id}: {rejection}"))

@@ -60,7 +60,8 @@ def touch_points(  # noqa: PLR0913  one for each option
         yield _touched_line(len(touched), each)
     write_whole(out, _step(seen, tip, touched))
     sizes = [float(np.linalg.norm(t.error)) for t in touched]
-    yield f"off by {1e3 * max(sizes):.2f} mm at most; {out}: the step, to put into the recipe"
+    step = f"{out}: the verify.touch step to paste into the recipe"
+    yield f"largest error {1e3 * max(sizes):.2f} mm; {step}"
 
 
 def _toucher(recipe: Recipe, tip: Floats, ask: Callable[[str], None]) -> Toucher:

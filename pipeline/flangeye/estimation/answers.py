@@ -1,4 +1,4 @@
-r"""The two answers, true and as reported: each a linear functional of the posterior.
+r"""The camera's poses for the true and for the reported arm, as linear functions of the posterior.
 
 *True*: the true places, with the arm's errors in their covariance. *As reported*: the places that
 fit the poses as the controller reports them. Commands are sent in reported coordinates, so the best
@@ -47,13 +47,13 @@ class Answer:
     shares: Mapping[str, Floats]
 
     def at(self, mean: Floats) -> Answer:
-        """Return the answer at other moves (P,), with the covariance about those."""
+        """Return these transforms at other values (P,), with the covariance there."""
         off = mean - self.mean
         return replace(self, mean=mean, covariance=self.covariance + np.outer(off, off))
 
 
 def functional(found: Estimate, a: Floats) -> Answer:
-    """Return the linear answer p + A delta, averaged over the mixture and (B, P, K) matrices A."""
+    """Return mean and covariance of p + A delta over the mixture and (B, P, K) matrices A."""
     p = found.posterior.model.p
     rows = np.concatenate([np.tile(np.eye(p), (len(a), 1, 1)), a], axis=2)
     each = rows @ found.posterior.mean
@@ -70,7 +70,7 @@ def functional(found: Estimate, a: Floats) -> Answer:
 
 
 def moves(found: Estimate, a: Floats) -> Floats:
-    """Return the (P,) mean of the linear answer p + A delta."""
+    """Return the (P,) posterior mean of p + A delta."""
     p, mean = found.posterior.model.p, found.posterior.mean
     return np.asarray(mean[:p] + a.mean(axis=0) @ mean[p:])
 
@@ -158,7 +158,7 @@ class _Commands:
         return out
 
     def _explained(self, by: Floats, moved: Floats) -> Floats:
-        """Return (B, 6, K): ``moved`` (W, 6, K) fitted by ``by`` (W, 6, 6) over each of B boxes."""
+        """Return (B, 6, K): twists ``moved`` (W, 6, K), fitted over each box by least squares."""
         # Turns count like what they do so far from the flange [m]: enough to determine the turn
         # about a line where the work is in one, and no more, for the work is at positions
         weight = np.repeat([0.02, 1.0], 3)[:, None]

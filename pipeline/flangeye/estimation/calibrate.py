@@ -394,7 +394,8 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
     # An error of exactly nothing is never claimed
     mm, deg = (f"{x:.3f}" if x >= 5e-4 else "below 0.001" for x in (shift * 1e3, np.degrees(turn)))
     notes: list[Note] = [
-        f"estimated noise of each pose in addition to its fit's: {mm} mm and {deg} deg per axis"
+        f"estimated noise of each pose, in addition to the noise of its fit: {mm} mm and {deg} deg "
+        f"per axis"
     ]
     if len(found.problem.ends) > 1:
         who = Counter((o.camera, o.target) for o in session.observations)
@@ -408,6 +409,7 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
     if weak.shape[1]:
         notes.append(
             f"not observable from these poses, and set to zero: {weak.shape[1]} translation"
-            f"{'s' if weak.shape[1] > 1 else ''} along which the arm's axes do not tilt"
+            f"{'s' if weak.shape[1] > 1 else ''} parallel to the only axis about which the arm "
+            f"turned"
         )
     return [*notes, *(certificate_notes(answer_of(found)) if options.certify else ())]

@@ -169,7 +169,7 @@ def _named(places: Floats | None, root: str, answer: CertifiedAnswer) -> dict[st
 
 
 def _far_away(shown: Certificate, root: str, answer: CertifiedAnswer) -> str | None:
-    """Return the note for an answer that is not at the minimum that was certified; else None."""
+    """Return a note if the answer is not at the certified minimum; None if it is."""
     places = _array(_turned(answer.places, root, answer))
     turns = shown.places[:, :3, :3] @ invert(places)[:, :3, :3]
     away = np.linalg.norm(rotation_log(turns), axis=1)

@@ -74,7 +74,7 @@ def _places(found: Estimate, carrier: Carrier) -> Floats:
 
 
 def _as_field(found: Estimate, carrier: Carrier) -> Floats:
-    """Return the weights with which the smooth error displaces the flange as other kinds do.
+    """Return smooth-field weights that displace the flange like the arm's other errors.
 
     They fit at the session's poses by least squares; the rigid part stays in the camera's pose.
     """

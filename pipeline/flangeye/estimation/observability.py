@@ -588,7 +588,7 @@ def _fault_of(poses: Floats) -> tuple[str, str] | None:
     if _about_one_line(poses):
         return f"turned only its last joint, about {named}", "tilt it about another axis too"
     return (
-        f"turned about one axis only, {named}, so that translation along it does not show",
+        f"turned about one axis only, {named}, so that translation along it is not observable",
         "tilt it about another axis too, or, where it has four joints, set unobservable: mark",
     )
 

@@ -161,7 +161,7 @@ def _require_enough(problem: Problem) -> None:
 
 
 def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
-    """Return the problem, places that most sightings agree on, which sightings do, and notes."""
+    """Return the problem, an initial guess, the mask of sightings that agree with it, and notes."""
     placed = all(problem.frames[target].place is not None for _, target in problem.ends)
     circles = problem.seen.ranks == 5
     spread = spread_of(problem.seen.centres)
@@ -207,8 +207,8 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
     raise CalibrationRefused(
         f"the sightings fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
         f"deg only, worst those of {target} by {camera}",
-        "check that each belongs to the poses beside it (join: clock_offset, where the clock of "
-        f"{camera} is another), and that the cell stands as the recipe states",
+        "check that each sighting belongs to the poses in its row (join: clock_offset, if "
+        f"{camera} has another clock), and that the cell is set up as the recipe states",
     )
 
 
@@ -279,8 +279,8 @@ def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem
         problem = _with_joints(problem, carrier.arm, _likeliest(problem, carrier, places, agree))
         if next(c for c in problem.carriers if c.arm == carrier.arm).joints is None:
             notes.append(
-                f"the model of {carrier.arm} misses the reported poses: errors of its joints are "
-                "not considered"
+                f"the kinematic model of {carrier.arm} does not reproduce the reported poses: "
+                f"errors of its joints are not estimated"
             )
     return problem, tuple(notes)
 
@@ -330,7 +330,7 @@ def _with_bad_normals_left_out(session: Session) -> Session:
     kept = int((out & again.inliers).sum())
     if not kept:
         return session
-    note = f"normals left out, for they disagree with the others: {kept}"
+    note = f"normals left out because they disagree with the others: {kept}"
     return replace(session, found=again).noted(note)
 
 
@@ -385,8 +385,8 @@ def _on_one_clock(session: Session) -> Session:
         if later is None:
             camera = max(total, key=lambda name: abs(total[name]))
             raise CalibrationRefused(
-                f"the clock of {camera} seems {total[camera] * 1e3:.1f} ms off, and where the arm "
-                "was then is not in the recording",
+                f"the clock of {camera} seems {total[camera] * 1e3:.1f} ms off, but the recording "
+                f"has no arm poses at the corrected times",
                 "record more before and after each capture, or let the arm stand still",
             )
         moved = replace(moved.refit(later), notes=session.notes)
@@ -396,7 +396,11 @@ def _on_one_clock(session: Session) -> Session:
         f"that {camera} gives"
         for (camera, x), sigma in zip(total.items(), sigmas, strict=False)
     ]
-    return moved.noted(f"the arms were at the poses {', '.join(told)}") if told else moved
+    return (
+        moved.noted(f"estimated time offset: the arms reached the recorded poses {', '.join(told)}")
+        if told
+        else moved
+    )
 
 
 def _with_size(session: Session, factor: float) -> Session:
@@ -533,5 +537,5 @@ def _with_offset(session: Session) -> Session:
     if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(1 - MISFIT, 3):
         return session
     listed = ", ".join(f"{value * 1e3:.3f}" for value in mean)
-    what = f"the seen circle is ({listed}) mm from the origin of the flange frame, in it"
+    what = f"the centre of the seen circle is at ({listed}) mm in the flange frame"
     return replace(session, found=again, tool_offset=mean).noted(what)

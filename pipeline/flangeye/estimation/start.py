@@ -355,7 +355,7 @@ def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
 
 
 def _linear(loop: _Loop, rows: Indices) -> dict[str, Floats]:
-    """Return camera and another place from centres, and normals where all have one.
+    """Return the camera's and another unknown place from centres, with normals if all have one.
 
     ``R_X c + t_X`` is the target's centre, before the camera's carrier. It is linear in the entries
     of R_X and t_X, and in those of the target's centre and axis in its carrier, or of R_Y and t_Y
@@ -397,7 +397,7 @@ def _facing(axis: Floats) -> Floats:
 
 
 def _anywhere(problem: Problem, rng: np.random.Generator) -> tuple[Places, Floats]:
-    """Return the lowest of descents from random places: the rotations first, then all."""
+    """Return the best local minimum from random starts: rotations first, then all unknowns."""
     best: tuple[Places, Floats] | None = None
     least, since = np.inf, 0
     for _ in range(60):
@@ -432,7 +432,7 @@ def _drawn(rng: np.random.Generator) -> Floats:
 def _descended(
     problem: Problem, places: Places, turns_alone: bool = False
 ) -> tuple[Places, Floats]:
-    """Return the places to which a start descends, and the squares there; outliers hardly count.
+    """Return the local minimum of a robust loss, from a start, and the squared errors there.
 
     Weights are those of Geman & McClure (1987) with each pair's median as scale, so they narrow as
     the fit improves. Steps are Levenberg-Marquardt.

@@ -53,7 +53,7 @@ class CameraFile(NamedTuple):
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         lens = f"{len(self.distortion)} coefficients" if self.distortion.any() else "no distortion"
         lens += f" of {self.lens_of}" if self.lens_of else ""
-        lens += f"; the first of {self.others + 1} in it" if self.others else ""
+        lens += f"; the first of {self.others + 1} cameras in this file" if self.others else ""
         return (
             f"camera of {self.path}: focal length {fx:.1f}, {fy:.1f} px, principal point {cx:.1f}, "
             f"{cy:.1f} px, {lens}"

@@ -38,7 +38,7 @@ def read_dxf(path: Path) -> tuple[Floats, str | None]:
         pieces += [np.stack([line[:-1], line[1:]], axis=1)] if len(line) > 1 else []
         if sum(map(len, pieces)) > MOST_PIECES:
             raise StageError(
-                f"{path}: holds more than {MOST_PIECES} pieces of lines; keep the seam only"
+                f"{path}: holds more than {MOST_PIECES} line segments; keep the seam only"
             )
     out = np.concatenate([np.zeros((0, 2, 3)), *pieces])
     if not np.isfinite(out).all():

@@ -15,7 +15,7 @@ from flangeye.files.clouds.plain import npy_shape, open_npz, open_text
 from flangeye.files.clouds.table import read_head
 from flangeye.files.images import is_depth_image
 from flangeye.files.recording import Recording
-from flangeye.types import FLANGE, Floats
+from flangeye.types import FLANGE, Floats, Warn
 
 Key = str | tuple[int, ...]
 
@@ -187,12 +187,14 @@ class Poses:
         count: Number of poses.
         files: The file of each pose, if each has its own; else empty.
         names: Name of each pose, if they have names; else empty.
+        ranked: Whether names that have no number in common with the scans' may be paired in order.
     """
 
     where: str
     count: int
     files: Sequence[Path] = ()
     names: Sequence[str] = ()
+    ranked: bool = False
 
     @property
     def apart(self) -> bool:
@@ -206,7 +208,8 @@ def scans_of(
     """Return the scans of each pose, and notes of how they were paired.
 
     The scans are in the folder, in subfolders (``images/``, ``clouds/``), or in a folder for each
-    pose. Named poses are paired by a common name or number, rows of a table by order.
+    pose. Named poses are paired by a common name or number, rows of a table by order. If no number
+    is common, ``ranked`` poses are paired in order, with a warning.
 
     Args:
         folder: Folder of the scans.
@@ -227,11 +230,15 @@ def scans_of(
     fitting, failed = {}, []
     for place, scans in places.items():
         try:
-            fitting[place] = _paired(poses, scans)
+            fitting[place] = _paired(replace(poses, ranked=False), scans)
         except StageError as error:
             failed.append((len(scans), error))
     if not fitting:
-        raise max(failed, key=lambda pair: pair[0])[1]
+        # Only then: a folder of other files, equal in number, must not compete with one that fits
+        fullest = max(places, key=lambda place: len(places[place]))
+        if not poses.ranked:
+            raise max(failed, key=lambda pair: pair[0])[1]
+        return _paired(poses, places[fullest])
     return _together(folder, [fitting[folder]] if folder in fitting else list(fitting.values()))
 
 
@@ -263,8 +270,32 @@ def _by_name(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path
     if not poses.names:
         note = in_order(poses.where, poses.count, "poses", [scans[stem][0].name for stem in stems])
         return list(scans.values()), [note]
-    order, note = partners(poses.where, poses.names, stems)
+    ranked = _in_rank(poses.names, stems) if poses.ranked else None
+    order, note = ranked or partners(poses.where, poses.names, stems)
     return [scans[stems[i]] for i in order], [note]
+
+
+def _in_rank(poses: Sequence[str], others: Sequence[str]) -> tuple[list[int], Warn] | None:
+    """Return partners in the order of the numbers in both names, with a warning.
+
+    Two counters that never meet, such as p0 … p7 and frame_101 … frame_108, count the same things.
+    If they share a number, pairing by number was meant, and a difference is a lost scan or pose.
+
+    Returns:
+        None if names share a number, have none, or differ in count.
+    """
+    keys, other_keys = numbers_of(poses), numbers_of(others)
+    each = {*keys, *other_keys}
+    if len(keys) != len(other_keys) or len(each) < 2 * len(keys) or {*map(len, each)} != {1}:
+        return None
+    ranks = {key: i for i, key in enumerate(sorted(keys))}
+    sorted_others = sorted(range(len(others)), key=other_keys.__getitem__)
+    order = [sorted_others[ranks[key]] for key in keys]
+    pairs = _example(poses, [others[i] for i in order])
+    return order, Warn(
+        f"poses and scans have no number in common, so they are paired in order: {pairs}",
+        "check the pairs; if they are wrong, name the scan of each pose in a column called scan",
+    )
 
 
 def _together(
@@ -299,7 +330,7 @@ def recording_of(name: str, pose: Floats, scans: Sequence[Path]) -> Recording:
         names = ", ".join(p.name for p in scans)
         raise StageError(f"pose '{name}' has more than one cloud or image: {names}")
     if len(clouds) + len(images) < len(scans):
-        raise StageError(f"{scans[0]}: is neither a cloud nor an image this can read")
+        raise StageError(f"{scans[0]}: is neither a cloud nor an image that flangeye reads")
     return Recording(
         name, {FLANGE: pose}, clouds[0] if clouds else None, image=images[0] if images else None
     )

@@ -140,7 +140,7 @@ def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> An
 
 
 def _text(node: yaml.Node, name: str) -> str:
-    """Return the text of a scalar; an escape can write what is not a character and has no UTF-8."""
+    """Return the text of a scalar; refuse escapes that are no valid Unicode characters."""
     text = str(node.value)
     if _SURROGATE.search(text):
         raise RecipeError(f"{name}:{node.start_mark.line + 1}: is not UTF-8 text")

@@ -110,7 +110,7 @@ class OffsetWrist:
         return value + self.fourth[1] * level.imag, (axis, upwards), (turn, lift, bend)
 
     def _brackets(self, orbits: Numbers) -> tuple[Floats, Floats]:
-        """Return the brackets in which the equation changes sign, and angles beside which it may.
+        """Return intervals with a sign change, and angles near which a root may be missed.
 
         Each row of samples is one branch; doubtful places are sampled more closely.
 
@@ -243,7 +243,7 @@ def _prepared(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist
 
 
 def _doubtful(values: Floats, change: float) -> Floats:
-    """Return the mask of samples (M, S) beside which two roots may lie.
+    """Return the mask of samples (M, S) near which two roots may lie between neighbours.
 
     The first and last samples are left out. Two roots without a change of sign between samples may
     lie at an extremum close to zero, and where the arm's reach ends.

@@ -142,7 +142,9 @@ def arm_body(robot: RobotModel | None, links: Mapping[int, str], near: Path) -> 
         RecipeError: The recipe has no arm, or the arm's surface is unknown.
     """
     if robot is None:
-        raise RecipeError(f"body: {ARM} is the arm itself; name it, robot: {{urdf: arm.urdf}}")
+        raise RecipeError(
+            f"body: {ARM} is the arm itself; name its URDF, robot: {{urdf: arm.urdf}}"
+        )
     if unknown := [number for number in links if not 0 <= number <= len(robot.joints)]:
         raise RecipeError(f"links: {robot.model} has links 0 to {len(robot.joints)}, not {unknown}")
     parts = [(k, *_read(near / name)) for k, name in links.items()] or [

@@ -274,9 +274,9 @@ class Cell:
         for observation, each in zip(observations, joints, strict=True):
             if each is None or arm is None or len(each) != len(arm.joints):
                 raise StageError(
-                    f"where {name} was at observation {observation.id} follows from the joint "
-                    f"angles of '{link.arm}', and there are none: record them, and name the "
-                    "robot's model in the recipe"
+                    f"where {name} was at observation {observation.id} is computed from the joint "
+                    f"angles of '{link.arm}', which are missing: record them, and name the robot's "
+                    f"model in the recipe"
                 )
         return np.array(joints)
 

@@ -35,7 +35,10 @@ def as_built(robot: RobotModel, path: Path) -> RobotModel:
         RecipeError: The file is not a UR's, cannot be read, or belongs to another arm.
     """
     if robot.maker != "Universal Robots" or robot.convention != "standard":
-        raise RecipeError(f"{path}: a factory calibration is a UR's; {robot.model} has none")
+        raise RecipeError(
+            f"{path}: only arms of Universal Robots have a factory calibration; {robot.model} has "
+            f"none"
+        )
     if not path.is_file():
         raise RecipeError(f"{path}: no such file; copy calibration.conf from the controller")
     if path.suffix in (".yaml", ".yml"):

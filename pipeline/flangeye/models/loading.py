@@ -89,8 +89,9 @@ def robot_of_joints(
     parsed = [parse_value("{" + text + "}", f"joint {i + 1}") for i, text in enumerate(joints)]
     given: dict[str, Any] = {
         "model": name, "maker": maker, "convention": convention, "joints": parsed,
-        "source": "stated when the file was made",
-        "volumes_missing": "the file has none; give the arm by its URDF, or add volumes to it",
+        "source": "entered by the user with flangeye new-robot",
+        "volumes_missing": "the arm's file has no volumes; give the arm by its URDF, or add "
+        "volumes to the file",
     }  # fmt: skip
     try:
         return RobotModel.model_validate({**given, "flange": {"standard": standard}})

@@ -121,7 +121,10 @@ def arm_of(
     to_base = urdf.chain(base)
     shared = _shared(to_base, to_flange)
     if any(joint.get("type") in MOVES for joint in to_base[shared:]):
-        raise RecipeError(f"{path}: base '{base}' moves against the arm; name a link before it")
+        raise RecipeError(
+            f"{path}: base '{base}' moves relative to the arm's foot; name a link nearer to the "
+            f"root"
+        )
     # The controller's base may be a side branch, as ROS-Industrial's `base` is: the arm's chain
     # begins where the two part
     # `root` is the last common link of both chains.
@@ -247,7 +250,7 @@ class UrdfBodies:
             if not capsule.radius > 0:
                 raise RecipeError(
                     f"{self.urdf.path}: the <{geometry[0].tag}> of link '{link}' has a radius of "
-                    f"{1e3 * capsule.radius:g} mm; give it one, or take the body away"
+                    f"{1e3 * capsule.radius:g} mm; give it a radius above zero, or remove the body"
                 )
             ends = [placed[:3, :3] @ end + placed[:3, 3] for end in (capsule.start, capsule.end)]
             start, end = (tuple(map(SI, point)) for point in ends)
@@ -326,7 +329,7 @@ def _notes(
     elif without:
         yield (
             f"{urdf.path}: {len(without)} of {len(robot.joints) + 1} links have no collision body "
-            f"({_some(without)}); a planned move does not keep clear of them"
+            f"({_some(without)}); planned moves may collide with them"
         )
 
 
@@ -418,7 +421,8 @@ def _flange(urdf: Urdf, asked: str | None) -> str:
     if len(links) == 1:
         return links[0]
     raise RecipeError(
-        f"{urdf.path}: which link is the flange, its origin in the plate's face and z outwards? "
+        f"{urdf.path}: which link is the flange, with its origin in the plate's face and z "
+        f"pointing outwards? "
         f"write flange: {' or '.join(links[:LINKS_NAMED]) or 'NAME'}"
     )
 

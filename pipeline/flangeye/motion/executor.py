@@ -48,7 +48,9 @@ class Executor:
                 hand.
         """
         if isinstance(robot, MovedByHand):
-            raise DeviceError(f"{robot.name}: is moved by hand; an arm that drives is needed")
+            raise DeviceError(
+                f"{robot.name}: is moved by hand; an arm that flangeye can drive is needed"
+            )
         self.robot, self.told, self.limits = robot, told, limits
         self._supervisor = Supervisor(model, limits)
         state = robot.state()

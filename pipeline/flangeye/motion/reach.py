@@ -411,7 +411,7 @@ def read_state(driver: RobotDriver) -> tuple[str, RobotState]:
         DeviceError: The driver has no way to read alone, or the arm cannot be read: why.
     """
     if driver.read is None:
-        raise DeviceError(f"{driver.name} has no way to read it without connecting to drive it")
+        raise DeviceError(f"{driver.name} cannot read the arm without taking control of it")
     try:
         with driver.read() as robot:
             return robot.name, robot.state()

@@ -126,8 +126,8 @@ class Supervisor:
         braking = 2.0
         if moves and (state.time_ns - self._halted_ns) * 1e-9 > braking:
             raise SafetyFault(
-                "the arm moves without a command from here: another program drives it and goes on; "
-                "stop it at the controller, then start again"
+                "the arm moves without a command of flangeye: another program drives it; stop that "
+                "program at the controller, then start again"
             )
 
     def _keep_limits(self, state: RobotState) -> None:

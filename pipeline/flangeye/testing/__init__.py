@@ -197,14 +197,18 @@ class ErrorConformance(Conformance):
     def test_the_true_pose_has_next_to_no_error(self) -> None:
         """The true pose has no error beyond the noise."""
         off = np.linalg.norm(self.measured(TRUE_CAMERA, observed(work_points())).displacement())
-        require(off < 0.1e-3, f"the true pose is said to be {1e3 * off:.3f} mm off")
+        require(
+            off < 0.1e-3, f"for the true pose the part reports an error of {1e3 * off:.3f} mm off"
+        )
 
     def test_a_candidate_that_is_off_is_off_by_so_much(self) -> None:
         """A candidate that is off by 3 mm has an error of 0.003 m at the work."""
         candidate = TRUE_CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]
         off = np.linalg.norm(self.measured(candidate, observed(work_points())).displacement())
-        require(abs(off - 3e-3) < 0.1e-3, f"3 mm are said to be {1e3 * off:.3f} mm")
+        require(
+            abs(off - 3e-3) < 0.1e-3, f"for an error of 3 mm the part reports {1e3 * off:.3f} mm"
+        )
 
     def test_too_little_is_refused(self) -> None:
         """Without kept poses the part refuses or returns None."""

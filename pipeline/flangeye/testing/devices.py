@@ -127,7 +127,7 @@ class RobotConformance(DriverConformance):
             first = robot.state().time_ns
             for _ in range(20):
                 robot.wait_cycle()
-            require(robot.state().time_ns > first, "20 cycles later the sample is as old as before")
+            require(robot.state().time_ns > first, "the sample's time is the same 20 cycles later")
 
     def test_a_joint_move_arrives_and_keeps_to_its_speed(self) -> None:
         """The joint moves there and back, never faster than the commanded limit."""
@@ -141,7 +141,7 @@ class RobotConformance(DriverConformance):
                 # A speed that is asked for may be exceeded by this much, for a cycle
                 require(
                     0.1 * SPEED < fastest <= SPEED * 1.05,
-                    f"a joint went at {fastest:.3g} rad/s, {SPEED} was said",
+                    f"a joint moved at {fastest:.3g} rad/s, commanded were {SPEED} rad/s",
                 )
 
     def test_it_stops_at_once(self) -> None:
@@ -153,7 +153,10 @@ class RobotConformance(DriverConformance):
             robot.stop()
             _, state = self._until_still(robot)
             gone = abs(state.joints[-1] - start[-1])
-            require(gone < 3 * TESTED_TURN, f"after stop() the joint went on to {gone:.3g} rad")
+            require(
+                gone < 3 * TESTED_TURN,
+                f"after stop() the joint moved {gone:.3g} rad from its start",
+            )
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
 
@@ -173,12 +176,13 @@ class RobotConformance(DriverConformance):
                 after = robot.state()
             gone = _apart(before, after)
             require(
-                gone < SPEED * RESTS, f"in {RESTS} s without a look it went on by {gone:.3g} rad"
+                gone < SPEED * RESTS,
+                f"without state() calls the arm moved on by {gone:.3g} rad in {RESTS} s",
             )
             on = max(_apart(after, state) for state in self._watch(robot, 0.5))
             require(
                 on < 0.1 * TESTED_TURN,
-                f"after {RESTS} s without a look it moves on by {on:.3g} rad",
+                f"the arm moves on by {on:.3g} rad when state() is called again after {RESTS} s",
             )
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
@@ -190,7 +194,7 @@ class RobotConformance(DriverConformance):
             robot.move_velocity(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]), 0.2)
             self._cycles(robot, GRACE + 1.0)
             speed = _fastest(robot.state())
-            require(speed < STANDING, f"without commands it still goes at {speed:.3g} rad/s")
+            require(speed < STANDING, f"without commands the arm still moves at {speed:.3g} rad/s")
             robot.move_joints(start, SPEED, ACCELERATION)
             self._until_still(robot)
 

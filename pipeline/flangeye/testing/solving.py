@@ -270,5 +270,5 @@ class VerifyConformance(SolvingConformance):
         for name, figure in here.figures.items():
             require(
                 np.isclose(there.figures.get(name, np.nan), figure, rtol=1e-3, atol=2e-6),
-                f"figure '{name}' depends on where the base stands",
+                f"figure '{name}' depends on the pose of the robot's base",
             )

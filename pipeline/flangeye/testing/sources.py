@@ -63,7 +63,8 @@ class AcquireConformance(Conformance):
         (first, some), (again, same) = self.acquired(), self.acquired()
         require(first.source.fingerprint, "the source has no fingerprint")
         require(
-            first.source.fingerprint == again.source.fingerprint, "the fingerprint is another now"
+            first.source.fingerprint == again.source.fingerprint,
+            "the fingerprint differs in a second call",
         )
         require(list(map(plain, some)) == list(map(plain, same)), "two runs' captures differ")
 
@@ -76,7 +77,8 @@ class AcquireConformance(Conformance):
         require(total is None or total == len(items), f"{total} were promised, {len(items)} came")
         roles = [capture.role for capture in only(items, t.Capture)]
         require(
-            roles == sorted(roles, key="calibration".__eq__), "captures for verifying come first"
+            roles == sorted(roles, key="calibration".__eq__),
+            "verification captures must come before calibration captures",
         )
 
     def test_poses_and_points_are_in_metres_and_frames(self) -> None:

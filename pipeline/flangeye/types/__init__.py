@@ -181,7 +181,7 @@ class CalibratedPose:
 
     @property
     def each(self) -> tuple[CalibratedPose, ...]:
-        """The transform and each of the others, as calibrated poses of their own."""
+        """One calibrated pose for each transform, this one's first."""
         return tuple(replace(self, transform=x, others=()) for x in (self.transform, *self.others))
 
     @property

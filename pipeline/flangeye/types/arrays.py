@@ -117,10 +117,10 @@ def as_line(note: str) -> str:
 
 
 def warnings_of(notes: Iterable[str]) -> list[Warn]:
-    """Return the notes that ask for something."""
+    """Return the notes that require action."""
     return [note for note in notes if isinstance(note, Warn)]
 
 
 def records_of(notes: Iterable[str]) -> list[str]:
-    """Return the notes for the record."""
+    """Return the notes that require no action."""
     return [note for note in notes if not isinstance(note, Warn)]

@@ -170,7 +170,7 @@ class HandEye:
         freeze(self, shared=(len(self.shared),))
 
     def as_reported(self) -> HandEye:
-        """Return the answer for the arm as its controller reports it, alone."""
+        """Return the calibration without the corrected arm's pose: for the arm as reported only."""
         known = self.correction and replace(
             self.correction, joint_offsets=None, field=None, lengths=None
         )

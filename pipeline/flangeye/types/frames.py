@@ -56,7 +56,9 @@ class PointCloud:
 
     @classmethod
     def __get_pydantic_json_schema__(cls, _schema: Any, _handler: Any) -> dict[str, Any]:
-        return {"description": "On the channel named like this one with /cloud added."}
+        return {
+            "description": "The points are on the channel with this channel's name plus /cloud."
+        }
 
 
 BASE, FLANGE, CAMERA, TARGET, TOOL = "base", "flange", "camera", "target", "tool"

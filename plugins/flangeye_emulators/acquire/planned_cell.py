@@ -151,8 +151,8 @@ def _require_places(cell: Cell, params: CellSessionParams) -> None:
     missing = [name for name in cell.unknown_frames if name not in params.places]
     if missing:
         raise StageError(
-            f"a simulated cell: places says where everything unknown truly is, and lacks "
-            f"{', '.join(missing)}: write places: {{{missing[0]}: {{position: [1 m, 0 m, 0 m]}}}}"
+            f"a simulated cell: places states the true pose of each unknown frame; missing: "
+            f"{', '.join(missing)}; write places: {{{missing[0]}: {{position: [1 m, 0 m, 0 m]}}}}"
         )
 
 

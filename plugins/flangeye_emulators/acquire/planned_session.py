@@ -87,7 +87,9 @@ def plan_session(
     if configuration.other_base and second is None:
         raise StageError("two arms need the recipe's 'second_robot' section: {model: …}")
     if four_axes and not exact:
-        raise StageError("an arm of four axes has no joints to be wrong; leave 'arm' out")
+        raise StageError(
+            "joint errors cannot be simulated for an arm of four axes; leave 'arm' out"
+        )
     cell = cell_of(configuration, robot, second.model if second else None)
     arms = {name: Arm(model) for name, model in cell.arms.items()}
     known = configuration.place

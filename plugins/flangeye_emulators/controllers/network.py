@@ -67,8 +67,8 @@ class Network:
             except OSError as error:
                 self.kill()
                 raise StageError(
-                    f"{self.host}:{port} cannot be opened ({_reason(error)}); where another "
-                    "controller runs there, take another --host, for example 127.0.0.6"
+                    f"{self.host}:{port} cannot be opened ({_reason(error)}); if another "
+                    f"controller runs there, choose another --host, for example 127.0.0.6"
                 ) from None
 
     def kill(self) -> None:

@@ -208,7 +208,8 @@ def _not_shown(
         instead = "it shows the board mirrored: switch off image flipping in the driver"
     what = board.kind if board.kind == "marker" else f"{board.kind}, {board.columns} x {board.rows}"
     return NothingSeen(
-        f"none of {len(missed)} of the {count} images, spread over all, shows the board ({what}); "
+        f"none of {len(missed)} of the {count} images, taken evenly from the session, shows the "
+        f"board ({what}); "
         f"{name}: {instead}"
     )
 
@@ -429,7 +430,7 @@ def _off_centre(usable: Sequence[Recording], camera: CameraFile) -> list[Warn]:
     cx, cy = camera.matrix[:2, 2]
     text = (
         f"{camera.path.name} has its principal point at {cx:.0f}, {cy:.0f} px, far from the middle "
-        f"of {width} x {height} px: it is of images of about {2 * cx:.0f} x {2 * cy:.0f} px"
+        f"of {width} x {height} px: it belongs to images of about {2 * cx:.0f} x {2 * cy:.0f} px"
     )
     fix = f"calibrate at {width} x {height} px, or scale its matrix by {1 / middle.mean():.3g}"
     return [Warn(text, fix)]
@@ -450,7 +451,10 @@ def _filed(root: Path, name: str | None) -> CameraFile | None:
     found = cameras_in(folder)
     if len(found) > 1:
         names = ", ".join(str(camera.path.relative_to(folder)) for camera in found)
-        raise StageError(f"{folder}: which took the images? write camera_file: one of {names}")
+        raise StageError(
+            f"{folder}: holds several camera calibrations; state which camera took the images, "
+            f"camera_file: one of {names}"
+        )
     return found[0] if found else None
 
 

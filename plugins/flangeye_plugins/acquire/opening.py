@@ -276,8 +276,8 @@ def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell
     links = [link for link in cell.links.values() if link.arm == name]
     if links and len(told) < len(recordings):
         raise StageError(
-            f"{root}: where link {links[0].number} of '{name}' is follows from its joint angles, "
-            f"and there are none: give their columns in the reader, arms: {{{name}: {{joints: …}}}}"
+            f"{root}: where link {links[0].number} of '{name}' is computed from its joint angles, "
+            f"which are missing: give their columns in the reader, arms: {{{name}: {{joints: …}}}}"
         )
     for recording in told:
         joints = recording.arm_joints[name]

@@ -32,7 +32,7 @@ LISTED = 160
 
 
 class Symmetry(NamedTuple):
-    """What the shape of a body leaves open of its pose.
+    """Directions of a body's pose that its shape determines, and its axis of symmetry.
 
     Attributes:
         freedoms: Number of the pose's directions that the shape determines: 6, of a body of

@@ -146,7 +146,7 @@ def clock(session: RecordedSession) -> Findings:
     delay = float(near[finer.which])
     which = "after" if delay > 0 else "before"
     whose = "the arm was" if session.seconds is None else f"{arm_name(arms)} was"
-    what = f"{whose} at the scans' poses {abs(delay) * 1e3:.0f} ms {which} they were recorded"
+    what = f"{whose} at the recorded poses {abs(delay) * 1e3:.0f} ms {which} the recorded times"
     corrected_session = others[finer.which].session.where(others[finer.which].known)
     if not helps(session.where(others[finer.which].known), corrected_session):
         return
@@ -426,7 +426,9 @@ def _require_known_place(session: RecordedSession) -> None:
     """
     session.require_samples()
     if session.carried == "camera":
-        raise NotApplicable("a constant offset of what carries the camera is part of the answer")
+        raise NotApplicable(
+            "a constant offset of the camera's carrier is absorbed by the estimated camera pose"
+        )
     if not np.isfinite(session.places).all():
         raise NotApplicable("the target's pose on the arm is unknown and absorbs any offset")
 

@@ -180,7 +180,9 @@ def motion(session: RecordedSession) -> Findings:
     name = "too little rotation" if needs else "too little motion"
     what = f"{_left_open(turn, shift)}: {_missing(session, needs, spread, axes)}"
     if session.marks_open and turn < TOO_UNCERTAIN:
-        yield Finding(name, what, "none needed: the recipe marks what stays open", note=True)
+        yield Finding(
+            name, what, "none needed: the recipe marks the unobservable directions", note=True
+        )
         return
     yield Finding(name, what, _advice(needs, axes < LITTLE <= spread))
 

@@ -347,7 +347,7 @@ def _choices(
     in_hand = session.carried == "camera"
     what = ", or ".join(dict.fromkeys(each.mistake(in_hand) for each in readings))
     made = [_read_so(session, each) for each in readings]
-    fits = ": the samples fit each" if len(made) > 1 else ""
+    fits = ": the samples fit all of these equally" if len(made) > 1 else ""
     name = "mounting" if readings[0].remounted else "pose direction"
     return name, what + fits, OR_ELSE.join(dict.fromkeys(line for line, _ in made)), made[0][1]
 

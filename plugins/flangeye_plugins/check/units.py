@@ -176,7 +176,7 @@ def _too_far(session: RecordedSession) -> Finding | None:
         if distance > 10 * allowed[1] and off[unit] == 0:
             factors[whose] = METRES[unit]
             told[whose] = {"scale": _number(METRES[unit])}
-            said.append(f"the {whose}'s are {distance:.4g} m away, and in {unit}")
+            said.append(f"the {whose}'s would be {distance:.4g} m away, so they are in {unit}")
     if not told:
         return None
     corrected = replace(session, centres=session.centres * factors["target"])
@@ -242,7 +242,7 @@ def size(session: RecordedSession) -> Findings:
         yield evidence.finding(name, what, corrected_session, fix)
     # Poses between which an arm's motion was interpolated are a little too near each other
     elif evidence.after.position <= HELPS**2 * evidence.before.position:
-        what = f"what the scanner measures fits the arm's motion if it is {factor:.4f} times as far"
+        what = f"the scanner's distances fit the arm's motion if {factor:.4f} times as long"
         what += " along its axis" if kind == "focal" else ""
         fix = session.stretched(1 + (factor - 1) * ALONG[kind]).step()
         yield evidence.finding("scale", what, corrected_session, fix)

@@ -204,13 +204,13 @@ def export_robot(
     correction = corrected.correction if corrected else None
     if correction is None or correction.joint_offsets is None:
         raise StageError(
-            "export.robot: no error of the arm's joints was found; add refine.arm, or see in its "
-            "notes why it left them out"
+            "export.robot: no joint error of the arm was estimated; add refine.arm, or read in its "
+            "notes why it estimated none"
         )
     # Only what differs from the defaults: the file is read and edited by people
     document = with_correction(robot, correction).model_dump(mode="json", exclude_defaults=True)
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=100)
-    comment = f"{pose.comment('#')}# The arm corrected, not as its controller has it.\n"
+    comment = f"{pose.comment('#')}# Corrected arm: differs from the controller's own model.\n"
     return ExportedFile(
         f"{params.name}.yaml", comment + text, "name it in a recipe: robot: {model: …}"
     )

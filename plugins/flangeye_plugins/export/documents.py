@@ -46,8 +46,10 @@ def ros2_command(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
     # A publisher runs until it is stopped, so all but the last go to the background
     text = pose.comment("#") + " &\n".join(lines) + "\n"
     if "\0" in text or not text.isascii():
-        raise StageError("export.ros2_command: a name cannot be written as a word of a shell")
-    return ExportedFile(f"{params.name}.ros2.sh", text, "run it in a shell that knows ROS 2")
+        raise StageError("export.ros2_command: a frame name cannot be quoted for a shell")
+    return ExportedFile(
+        f"{params.name}.ros2.sh", text, "run it in a shell in which ROS 2 is sourced"
+    )
 
 
 def ros2_launch(pose: CalibratedPose, params: FramesParams) -> ExportedFile:

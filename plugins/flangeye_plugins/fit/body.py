@@ -186,15 +186,15 @@ def _unlike(
     if fit.odd > chi2_quantile(0.99, len(fit.lost) + 1):
         low, high = fit.lost.min() * 1e3, fit.lost.max() * 1e3
         return Rejected(
-            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}, more "
-            "unlike than a scanner's edge loss: the fit used edges of another object, or the mesh "
+            f"the scan's edges are {low:+.1f} to {high:+.1f} mm off the ends of {name}, more than "
+            f"a scanner loses at edges: the fit used edges of another object, or the mesh "
             "is another body's; scan from where more of its ends are seen"
         )
     larger, unsure = fit.oversize, fit.unsure(params.model_error, distortion)
     if (larger / unsure) ** 2 > chi2_quantile(0.99, 1):
         return Rejected(
             f"the scan shows {name} in another size than its mesh has: the mesh's scale is wrong, "
-            "or what was found is another thing",
+            "or another object was found",
             f"{'larger' if larger > 0 else 'smaller'} by {abs(larger):.1%} at least, known to "
             f"{unsure:.1%}",
         )

@@ -182,7 +182,7 @@ def _why_not(offset: float, coverage: float, params: SphereProfileParams) -> str
     if not least <= offset <= most:
         return (
             f"the laser passes {offset:.2f} radii beside the sphere's centre, {least:g} to "
-            f"{most:g} are asked for; move the scanner across its line"
+            f"{most:g} are allowed; move the scanner across its line"
         )
     if coverage < params.min_coverage:
         return f"{coverage:.0%} of the circle is seen, at least {params.min_coverage:.0%} is needed"

@@ -173,7 +173,8 @@ class Chooser:
         axis = np.linalg.eigh(part)[1][:, -1]
         axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
         return (
-            f"expected error at the work {errors[0]:.2f} to {errors[1]:.2f} mm rms, mostly by the "
+            f"expected error at the work from {errors[0]:.2f} to {errors[1]:.2f} mm rms, mostly in "
+            f"the "
             f"{word} base {in_base(axis, 2)}"
         )
 

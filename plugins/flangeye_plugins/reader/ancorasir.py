@@ -241,7 +241,10 @@ def _centres(folder: Path, poses: Poses, unit: float) -> dict[str, Floats]:
         # A centre belongs to the pose whose position [m] its column of p_robot_mat repeats this
         # well
         if not distances[nearest] < 1e-6:
-            raise StageError(f"{files[0]}: column {column} is the position of no pose that is left")
+            raise StageError(
+                f"{files[0]}: column {column} is at the position of no pose, or of one already "
+                f"taken"
+            )
         if not np.isfinite(centre).all():
             raise StageError(f"{files[1]}: column {column} is not finite")
         found[names[nearest]] = centre

@@ -35,7 +35,9 @@ def auto(
         )
     untried = [name for name, reader in bound.items() if reader is None]
     if untried:
-        missed.append(f"not tried, for a recipe must give their parameters: {', '.join(untried)}")
+        missed.append(
+            f"not tried, because a recipe must give their parameters: {', '.join(untried)}"
+        )
     raise NotThisLayout(
         f"{path}: no reader knows this layout; 'flangeye init {path}' writes a recipe for other "
         f"layouts; tried: {'; '.join(missed)}"

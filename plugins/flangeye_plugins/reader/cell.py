@@ -307,7 +307,10 @@ def _by_time(
     # The mean of a standstill's measurements holds only if nothing else of the cell moved meanwhile
     still = [p for p in pairs if all(_stands(each, p, events) for each in moved)]
     if len(still) < len(pairs):
-        notes.append(f"left out {len(pairs) - len(still)} poses, at which something else moved")
+        notes.append(
+            f"left out {len(pairs) - len(still)} poses at which another arm or axis of the cell "
+            f"moved"
+        )
     found = [
         _recording(seen, f"{i:04}", p.mean(values), _moment(first, moved, p))
         for i, p in enumerate(still)

@@ -109,7 +109,7 @@ def _offset(
             return offset, f"clock offset {_ms(offset)}, {how}"
     if len(spans) >= MIN_CAPTURES:
         offset = offset_into(list(spans), events)
-        return offset, f"clock offset {_ms(offset)}, the least that fits the standstills"
+        return offset, f"clock offset {_ms(offset)}, the smallest that fits the standstills"
     return 0.0, "clock offset assumed to be 0 ms: the recording does not show it"
 
 

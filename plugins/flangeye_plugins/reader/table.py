@@ -189,7 +189,9 @@ def _with_scans(folder: Path, text: Table, poses: Floats, params: TableParams) -
     times, joints = times_of(text, params.time, params.time_unit), params.angles(text)
     second = _second(folder, text, params)
     if second is not None and second.table is not text:
-        raise StageError(f"{second.table.file}: a second arm beside scans stands in the same table")
+        raise StageError(
+            f"{second.table.file}: with scans, the second arm's poses must be in the same table"
+        )
     apart = len({at[0].parent for at in found}) == len(found) > 1  # a folder for each pose
     recordings = [
         replace(
@@ -211,7 +213,7 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
     """
     column = _scan_column(text, params)
     files = text.files if len(text.files) == len(text.rows) > 1 else ()
-    poses = Poses(str(text.file), len(text.rows), files, text.names)
+    poses = Poses(str(text.file), len(text.rows), files, text.names, ranked=True)
     if column is None:
         return scans_of(folder, poses, text.files)
     named = text.texts(column)
@@ -220,11 +222,13 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
         return [[path] for path in found if path], []
     # The column may name rows instead of files: scans then match by name or number
     if not any(found) and all(named):
-        called = replace(poses, names=[PurePath(name).stem for name in named])
+        files_named = bool(PurePath(named[0]).suffix)
+        stems = [PurePath(name).stem for name in named]
+        called = replace(poses, names=stems, ranked=not files_named)
         try:
             return scans_of(folder, called, text.files)
         except StageError:
-            if not PurePath(named[0]).suffix:
+            if not files_named:
                 raise
     missed = found.index(None)
     told = f"{text.where(missed)}: its scan '{named[missed]}' does not exist"

@@ -82,7 +82,7 @@ class MechEye(OpenScanner):
         status, unit = self._camera.get_point_cloud_unit()
         _require(status, self.name)
         if unit != metres:
-            raise DeviceError(f"{self.name}: its points stay in unit {unit}, metres are needed")
+            raise DeviceError(f"{self.name}: its points remain in unit {unit}, metres are needed")
 
     def expose(self) -> Callable[[], Scan]:
         """Capture a frame; the arm must wait until it has arrived."""

@@ -65,8 +65,8 @@ def seam_cad(
     seam = _chosen(workpiece, params.seam)
     if scan.places:
         raise CalibrationRefused(
-            f"{STAGE}: the scan is put together from {len(scan.places)} places, and a CAD is "
-            "registered to what one place sees",
+            f"{STAGE}: the scan is stitched from {len(scan.places)} places, but a CAD is "
+            f"registered to a scan from one place only",
             "plan the seam with seam.joint",
         )
     seen = seen_in_base(STAGE, scan, answer, robot)

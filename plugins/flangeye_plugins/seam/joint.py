@@ -368,8 +368,8 @@ def _judged(found: FoundJoint, params: JointParams) -> dict[str, float]:
         raise CalibrationRefused(told, "name the joint that is there (joint)")
     if astray is not None:
         raise CalibrationRefused(
-            f"{STAGE}: from {astray[0] * 1e3:.0f} to {astray[1] * 1e3:.0f} mm along it most points "
-            f"are not on the {params.joint} joint that was found",
+            f"{STAGE}: from {astray[0] * 1e3:.0f} to {astray[1] * 1e3:.0f} mm along the seam most "
+            f"points are not on the {params.joint} joint that was found",
             "give more rough points there, or end the line before",
         )
     return {

@@ -89,7 +89,7 @@ def for_the_controller(
             f"the seam cannot be corrected for the arm's error: {error}",
             "move the workpiece to where the arm was calibrated, or write arm: as-reported",
         ) from None
-    note = "points are commands for the controller, with the arm's estimated error taken off"
+    note = "points are commands for the controller, with the arm's estimated error subtracted"
     return replace(seam, points_in_base=np.array(told)[:, :3], notes=(*seam.notes, note))
 
 

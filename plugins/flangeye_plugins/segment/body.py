@@ -170,7 +170,9 @@ def _searched(
         images = [one for pose in found for one in search.images(pose) if passes(one)]
         if not (found := search.unrivalled(found, images)):
             what, fix, _ = _otherwise(body)[0]
-            return Rejected(f"{body.name} is {what}: its image explains more", fix=fix)
+            return Rejected(
+                f"{body.name} is {what}: its mirror image fits the scan better", fix=fix
+            )
     # One that fails narrowly and explains as much leaves it open which of them is right
     near = [o for o in every if not passes(o) and o.verdict.trusted >= params.min_trust]
     return found + search.twins_among(near, found)
@@ -208,7 +210,9 @@ def _misdrawn(
 
     for what, fix, other in _otherwise(body):
         if any(map(passes, BodySearch(points, prepared(other), passes).quickly())):
-            return Rejected(f"{body.name} is {what}: corrected, it would be found", fix=fix)
+            return Rejected(
+                f"{body.name} is {what}: with a corrected mesh it would be found", fix=fix
+            )
     shape = prepared(body)
     vertices, facets = shape.facets
     # Parts that stand elsewhere hide some of the rest, and a rest is found in clutter sooner.

@@ -110,7 +110,7 @@ def solve_iterative(
     search = improve_pool(first, stream, evaluate, params.required, params.k_max)
     _require_finite(search, len(observations.seen))
     answer, notes = solve_pool(search.pool), [_stopped(search, params)]
-    losers = {**search.losers, **{o.id: "kept from the pool to measure on" for o in kept}}
+    losers = {**search.losers, **{o.id: "kept out of the pool to measure the error" for o in kept}}
     estimate = _with_covariance(answer, search.pool, observations.seen)
     return hand_eye(observations.seen, estimate, "solve.iterative", losers, notes)
 
@@ -149,7 +149,7 @@ def _try(newcomer: Observation, search: SearchState, evaluate: Evaluate) -> None
         search.pool, search.cost = pools[best], costs[best]
     else:
         search.losers[newcomer.id] = (
-            f"did not help the pool: {_mm(costs[best])} at best instead of {_mm(search.cost)}"
+            f"did not improve the pool: {_mm(costs[best])} at best instead of {_mm(search.cost)}"
         )
 
 

@@ -86,7 +86,7 @@ def _extent(controller: Controller, plan: Path) -> str:
     """Return a text that says which part of the seam was welded before the stop."""
     root = follower_of(controller)
     if root is None:
-        return f"its torch had come to {controller.torch * 1e3:.0f} mm"
+        return f"the torch had reached {controller.torch * 1e3:.0f} mm"
     if root.arc_from is None:
         return "nothing was welded"
     begin, end = max(root.arc_from, 0.0), min(root.torch, plan.length)

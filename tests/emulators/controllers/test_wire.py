@@ -310,8 +310,7 @@ def loopback(
         ),
         (
             ["ur5e", "--host", "203.0.113.1"],
-            "error: 203.0.113.1:30004 cannot be opened (Cannot assign requested address); where "
-            "another controller runs there, take another --host, for example 127.0.0.6\n",
+            "error: 203.0.113.1:30004 cannot be opened (Cannot assign requested address); if another controller runs there, choose another --host, for example 127.0.0.6\n",
         ),
         (
             ["ur5e", "--fault", "melt"],
@@ -330,6 +329,5 @@ def test_mistakes_on_the_command_line_are_one_line(
 def test_a_taken_address_is_said(process: Any, loopback: Callable[..., Any]) -> None:
     assert loopback("ur5e", "--host", process.host) == (
         2,
-        f"error: {process.host}:30004 cannot be opened (Address already in use); where another "
-        "controller runs there, take another --host, for example 127.0.0.6\n",
+        f"error: {process.host}:30004 cannot be opened (Address already in use); if another controller runs there, choose another --host, for example 127.0.0.6\n",
     )

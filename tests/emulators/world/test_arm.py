@@ -165,7 +165,7 @@ def test_a_link_that_carries_the_camera_is_off_too() -> None:
 
 
 def test_four_axes_have_no_joints_to_be_wrong() -> None:
-    with pytest.raises(StageError, match="four axes has no joints to be wrong; leave 'arm' out"):
+    with pytest.raises(StageError, match="simulated for an arm of four axes; leave 'arm' out"):
         planned(ArmErrors(quality="real"), motion="four_axes")
 
 

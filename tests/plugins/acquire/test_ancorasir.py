@@ -246,7 +246,7 @@ def test_centres_and_poses_that_do_not_belong_together(repository: Path) -> None
     assert refused(folder) == f"{folder}/p_camera_mat.npy: column 0 is not finite"
     np.save(folder / "p_robot_mat.npy", POSITIONS[FITTED].T)
     assert refused(folder) == (
-        f"{folder}/p_robot_mat.npy: column 0 is the position of no pose that is left"
+        f"{folder}/p_robot_mat.npy: column 0 is at the position of no pose, or of one already taken"
     )
     np.save(folder / "p_robot_mat.npy", POSITIONS)
     assert refused(folder) == (

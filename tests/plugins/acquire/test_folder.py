@@ -254,7 +254,7 @@ def test_auto_asks_the_readers_of_plugins_too(tmp_path: Path) -> None:
         f"{tmp_path}: no reader knows this layout; 'flangeye init {tmp_path}' writes a recipe for "
         "other layouts; tried: acme (holds no scans.acme); ancorasir (holds "
     )
-    untried = str(error.value).partition("; not tried, for a recipe must give their parameters: ")[
-        2
-    ]
+    untried = str(error.value).partition(
+        "; not tried, because a recipe must give their parameters: "
+    )[2]
     assert "strange" in untried.split(", ")

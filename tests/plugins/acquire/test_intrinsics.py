@@ -109,7 +109,7 @@ def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_name
         return find_corners(board, image, thorough)
 
     monkeypatch.setattr("flangeye_plugins.acquire.images.find_corners", counted)
-    with pytest.raises(StageError, match="none of 8 of the 12 images, spread over all") as refused:
+    with pytest.raises(StageError, match="none of 8 of the 12 images, taken evenly") as refused:
         lens_of(seen, Board("checkerboard", 10, 7, 0.02))
     assert said in str(refused.value)
     assert (len(looked), sum(looked)) == (10, 2)

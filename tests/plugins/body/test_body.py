@@ -482,7 +482,7 @@ def test_a_mirrored_mesh_that_a_half_turn_hides_is_refused_by_what_its_image_exp
     mirrored = TargetBody("ring-plate", plate.vertices * [-1, 1, 1], plate.triangles)
     refused = found(capture, mirrored)
     assert isinstance(refused, Rejected)
-    assert "drawn mirrored: its image explains more" in refused.reason
+    assert "drawn mirrored: its mirror image fits the scan better" in refused.reason
     assert "mirror the mesh" in refused.fix
     assert isinstance(found(capture, plate), FlangeCloud)
 

@@ -585,7 +585,7 @@ def test_a_corrected_arm_is_a_robot_file_of_lines_that_are_read_again(lengths: A
 @pytest.mark.parametrize("correction", [None, ArmCorrection(np.zeros(3))])
 def test_an_arm_whose_joints_were_not_corrected_is_no_robot_file(correction: Any) -> None:
     robot = load_model("robots", "ur5e")
-    with pytest.raises(StageError, match=r"export\.robot: no error of the arm's joints was found"):
+    with pytest.raises(StageError, match=r"export\.robot: no joint error of the arm was estimated"):
         export_robot.function(CalibratedPose(BENIGN), calibrated(correction), robot, NamedParams())
 
 

@@ -114,7 +114,7 @@ def test_a_profile_near_the_middle_is_worth_little_across() -> None:
         (profile()[:20], "the laser passes 0.00 radii beside the sphere's centre, "),
         (
             profile(np.array([0.0, 0.992 * SPHERE.radius, 0.25]), noise=SI(0)),
-            "the laser passes 0.99 radii beside the sphere's centre, 0.4 to 0.97 are asked for; ",
+            "the laser passes 0.99 radii beside the sphere's centre, 0.4 to 0.97 are allowed; ",
         ),
         (
             profile(np.array([0.0, 0.994 * SPHERE.radius, 0.25]), noise=SI(0)),
@@ -130,8 +130,7 @@ def test_a_profile_near_the_middle_is_worth_little_across() -> None:
         ),
         (
             profile(np.array([0.0, 0.32 * SPHERE.radius, 0.25])),
-            "the laser passes 0.32 radii beside the sphere's centre, 0.4 to 0.97 are asked for; "
-            "move the scanner across its line",
+            "the laser passes 0.32 radii beside the sphere's centre, 0.4 to 0.97 are allowed; move the scanner across its line",
         ),
     ],
 )

@@ -58,7 +58,7 @@ def test_parallel_flanges_leave_the_distance_to_the_scanners_own() -> None:
 def test_poses_that_look_elsewhere_are_refused() -> None:
     joints = [facing(np.array(p), 0.0) for p in ([0.45, -0.15, 0.35], [0.6, 0.2, 0.3])]
     sideways = rigid(rotation_from_rpy(np.pi / 2, 0.0, 0.0), [0.4, 0.3, 0.4])
-    with pytest.raises(StageError, match=r"^view.shown: one of the flanges looks \d+ deg away"):
+    with pytest.raises(StageError, match=r"^view.shown: in one pose the flange faces \d+ deg away"):
         shown([*joints, ARM.inverse(sideways)[0]])
 
 

@@ -14,7 +14,7 @@ from tests.plugins.fixed import fixed
 from tools.study_next_best import compare
 
 SAID = (
-    r"expected error at the work ([\d.]+) to ([\d.]+) mm rms, mostly by the (?:turn about|"
+    r"expected error at the work from ([\d.]+) to ([\d.]+) mm rms, mostly in the (?:turn about|"
     r"shift along) base \(.*\)"
 )
 CENTRE, EYE = np.array([0.6, 0.0, 0.3]), np.array([0.6, 0.0, 1.0])

@@ -169,8 +169,8 @@ def _of_one_camera(data: Any) -> None:
          "or all by number"),
         (_as_axis, "{}: 'arm' is an arm, and has one value a pose; give its poses in the reader's "
          "arms"),
-        (_on_a_link, "{}: where link 3 of 'arm' is follows from its joint angles, and there are "
-         "none: give their columns in the reader, arms: {{arm: {{joints: …}}}}"),
+        (_on_a_link, "{}: where link 3 of 'arm' is computed from its joint angles, which are "
+         "missing: give their columns in the reader, arms: {{arm: {{joints: …}}}}"),
         (_five_joints, "{}: 'arm' has 5 joint angles, and a ur5 has 6 joints"),
         (_of_one_camera, "{}: holds recordings of a cell; describe it in the recipe: cell: "
          "{{arms: …}}"),
@@ -273,7 +273,9 @@ def test_streams_are_joined_by_time_where_everything_stands_still(tmp_path: Path
     })  # fmt: skip
     archive = cell(tmp_path, params)
     assert len(archive.recordings) == 7
-    assert "left out 1 poses, at which something else moved" in " ".join(archive.notes)
+    assert "left out 1 poses at which another arm or axis of the cell moved" in " ".join(
+        archive.notes
+    )
     for i, recording in enumerate(archive.recordings):
         assert np.allclose(recording.poses["arm"], stops[i], atol=1e-6)
         assert recording.axes["rail"] == pytest.approx(0.1 * i, abs=1e-9)
@@ -376,9 +378,9 @@ def test_tables_of_an_arm_that_passed_while_its_rail_slid_give_the_time_between_
     recipe = parse_recipe(SLIDING.replace("FOLDER", str(tmp_path)), "r", REGISTRY)
     runner = Runner(recipe, REGISTRY, ArchivePath(None))
     found = runner.solve(runner.take(None), Source("tables"))
-    (told,) = [note for note in found.notes if "the arms were at the poses" in note]
-    assert re.match(
-        "the arms were at the poses (59.[5-9]|60.[0-5]) .* after the times that left", told
+    (told,) = [note for note in found.notes if "the arms reached the recorded poses" in note]
+    assert re.search(
+        "the arms reached the recorded poses (59.[5-9]|60.[0-5]) .* after the times that left", told
     )
     assert found.camera.transform.matrix == pytest.approx(left, abs=1e-3)
 

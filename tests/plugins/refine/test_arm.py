@@ -116,7 +116,9 @@ def test_one_orientation_identifies_none_and_still_predicts() -> None:
     found = refined(only_places=True, count=30)
     (said,) = [n for n in found.notes if n.startswith("the poses identify")]
     assert said.startswith("the poses identify none of the arm's 24 parameters singly (one orient")
-    assert "the correction predicts at poses like these, and says nothing of any one joint" in said
+    assert (
+        "the correction is valid at similar poses, and gives no value for any single joint" in said
+    )
     assert found.corrected is not None
 
 
@@ -162,7 +164,7 @@ def test_an_arm_of_seven_joints_without_their_angles_tells_no_parameter_singly()
     calibration = solve_robust(Observations(observations, Source("")), RobustParams(), robot=panda)
     found = refine_arm(calibration, fixed(ArmParams, propose=0), panda)
     assert any("parameters singly" in n and "identify none" in n for n in found.notes)
-    assert any("in any number of ways that fit alike" in n for n in found.notes)
+    assert any("in any number of ways that fit equally" in n for n in found.notes)
 
 
 def test_it_proposes_poses_that_would_tell_more() -> None:
@@ -180,7 +182,7 @@ def test_a_perfect_arm_is_left_as_it_is() -> None:
     calibration = solved(observed(25, 1, 0.4, ArmErrors(zeros="0 mrad")))
     found = refine_arm(calibration, ArmParams(), UR5)
     assert found.corrected is None
-    assert found.notes[-1].startswith("the arm's parameters are left out")
+    assert found.notes[-1].startswith("the arm's parameters are not corrected")
 
 
 def test_the_answer_for_the_arm_as_reported_stays() -> None:
@@ -206,5 +208,5 @@ def test_the_corrected_arm_is_a_robot_file() -> None:
     correction, arm = found.corrected.correction, Arm(UR5)
     expected = arm.perturbed(correction.lengths).flange(HOME + correction.joint_offsets)
     assert Arm(read).flange(HOME) == pytest.approx(expected, abs=1e-9)
-    with pytest.raises(StageError, match="no error of the arm's joints was found; add refine.arm"):
+    with pytest.raises(StageError, match="no joint error of the arm was estimated; add refine.arm"):
         export_robot(pose, found.as_reported(), UR5, NamedParams())

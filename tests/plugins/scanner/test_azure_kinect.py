@@ -152,7 +152,7 @@ def test_a_missing_recording_or_python_is_said(tmp_path: Path) -> None:
         f"scanner.azure_kinect: no recording at {path}"
     )
     assert refused(AzureKinectParams(python="other")) == (
-        "scanner.azure_kinect: this machine names no 'other' (it names: none); a recipe may not "
+        "scanner.azure_kinect: this machine's settings have no entry 'other' (entries: none); a recipe may not "
         f'choose programs or libraries: write other = "/its/path" under [programs] in {settings_file()}'
     )
 

@@ -133,7 +133,7 @@ def test_the_scanner_can_be_lost(controller: Any) -> None:
             scanner.expose()
     assert not isinstance(error.value, FrameDropped)
     assert str(error.value) == (
-        "simulated phoxi-m, seed 0: gone after 2 exposures, as lost_after says"
+        "simulated phoxi-m, seed 0: disconnected after 2 exposures, as lost_after states"
     )
 
 

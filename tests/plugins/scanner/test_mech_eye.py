@@ -127,6 +127,6 @@ def test_what_a_camera_does_not_do_is_said(camera: Any) -> None:
     assert str(error.value) == "Mech-Eye PRO M NEM1: Device is offline. (error -2)"
     camera.unit = None
     assert refused(MechEyeParams(address="10.0.0.7")) == (
-        "Mech-Eye PRO M NEM1: its points stay in unit None, metres are needed"
+        "Mech-Eye PRO M NEM1: its points remain in unit None, metres are needed"
     )
     assert camera.closed == 1

@@ -186,7 +186,7 @@ def test_a_thing_that_lies_across_the_seam_is_told_of() -> None:
     points[covered, 2] = BASE_T_CAMERA.inverse().apply(truth[:1])[0, 2] - 12 * MM
     over = replace(scan, cloud=PointCloud(CAMERA, points.astype(np.float32)))
     with pytest.raises(
-        CalibrationRefused, match="from 8[0-9] to 1[12][0-9] mm along it most points"
+        CalibrationRefused, match="from 8[0-9] to 1[12][0-9] mm along the seam most points"
     ):
         in_groove(over, truth)
 

@@ -114,5 +114,5 @@ def test_a_drawing_in_another_unit_is_refused(tmp_path) -> None:
 
 def test_a_drawing_that_is_too_large_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("flangeye.files.drawings.MOST_PIECES", 3)
-    with pytest.raises(StageError, match="holds more than 3 pieces of lines; keep the seam only"):
+    with pytest.raises(StageError, match="holds more than 3 line segments; keep the seam only"):
         line_of(dxf(tmp_path, ("CIRCLE", 10, 0, 20, 0, 40, 30)))

@@ -46,7 +46,7 @@ def test_what_is_told_to_the_controller_brings_the_tool_to_the_seam() -> None:
     assert corrected_flange(commanded, None, CORRECTION, arm) == pytest.approx(wanted, abs=1e-8)
     first = (commanded @ [0, 0, 0.15, 1])[:3]
     assert told.points_in_base[0] == pytest.approx(first, abs=1e-6)
-    assert "the arm's estimated error taken off" in told.notes[-1]
+    assert "the arm's estimated error subtracted" in told.notes[-1]
 
 
 def test_the_arm_as_reported_needs_nothing() -> None:
@@ -99,8 +99,8 @@ def checked(tmp_path, solve):
 
 def test_a_recipe_that_mixes_the_two_arms_fails_check(tmp_path: Path) -> None:
     assert checked(tmp_path, "solve.robust")
-    with pytest.raises(RecipeError, match=r"r.yaml:18: steps.6.seam.joint.arm: the corrected arm"):
+    with pytest.raises(RecipeError, match=r"r.yaml:18: steps.6.seam.joint.arm: arm: corrected is"):
         checked(tmp_path, "solve.svd")
     mixed = "solve.robust\n  - refine.compensate"
-    with pytest.raises(RecipeError, match="refine.compensate gives the pose for the arm as its co"):
+    with pytest.raises(RecipeError, match="refine.compensate gives the pose only for the arm as"):
         checked(tmp_path, mixed)

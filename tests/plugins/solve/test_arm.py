@@ -102,7 +102,7 @@ def test_a_tool_offset_is_found_when_the_flange_turns(ur5: RobotModel) -> None:
     calibration = solver(ur5)(simulate(ur5, 30, tool=offset))
     assert calibration.correction is not None
     np.testing.assert_allclose(calibration.correction.tool_offset, offset, atol=0.3 * MM)
-    assert any("the seen circle is (2." in note for note in calibration.notes)
+    assert any("the seen circle is at (2." in note for note in calibration.notes)
     assert max(np.linalg.norm(p.residual) for p in calibration.pairs) < 0.3 * MM
 
 

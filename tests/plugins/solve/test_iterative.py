@@ -113,9 +113,9 @@ def test_every_pose_outside_the_pool_says_why() -> None:
     unused = [p.reason for p in calibration.pairs if not p.used]
     assert len(used) == 4
     assert len(unused) == 26
-    assert unused[:6] == ["kept from the pool to measure on"] * 6
+    assert unused[:6] == ["kept out of the pool to measure the error"] * 6
     assert all(
-        reason.startswith(("replaced in the pool by", "did not help the pool"))
+        reason.startswith(("replaced in the pool by", "did not improve the pool"))
         for reason in unused[6:]
     )
     assert calibration.notes[0].startswith("cost 0.")

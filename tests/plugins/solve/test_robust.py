@@ -266,7 +266,7 @@ def test_a_wrong_normal_does_not_cost_its_centre() -> None:
     observations[2] = Observation("02", wrong, by_frame(observations[2].base_T_flange))
     calibration = solve(observations)
     assert all(p.used for p in calibration.pairs)
-    assert "normals left out, for they disagree with the others: 1" in calibration.notes
+    assert "normals left out because they disagree with the others: 1" in calibration.notes
 
 
 def in_line(n: int, normal: float | None, tilt: float) -> list[Observation]:

@@ -73,8 +73,12 @@ def test_in_a_bend_the_tool_stands_askew_and_turns() -> None:
 @pytest.mark.parametrize(
     ("prior", "asked", "told"),
     [
-        ({"along_sigma": 2e-3}, {}, "most of it along_sigma, as the tool is askew"),
-        ({"tip_sigma": 2e-3}, {}, "most of it tip_sigma, as the tool turns"),
+        (
+            {"along_sigma": 2e-3},
+            {},
+            "most of it along_sigma, because the tool is askew to the seam",
+        ),
+        ({"tip_sigma": 2e-3}, {}, "most of it tip_sigma, because the tool turns"),
         (
             {},
             {"gain_drift": 0.9},

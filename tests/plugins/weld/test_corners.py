@@ -168,7 +168,7 @@ def test_a_tip_pressed_against_one_wall_leads_the_torch_round_its_corners(turn: 
 def test_an_arc_that_the_plan_is_off_by_as_much_as_its_radius_stops_or_is_followed() -> None:
     """The arm is then near the arc's centre, from where all of its places are as near."""
     found = round_a_corner(-58.5, "groove", (-0.6e-3, 3.2e-3, 0.0), -0.0175, side="right")
-    assert found.done or "place along it is not observable" in found.controller.reason
+    assert found.done or "position along the seam is not observable" in found.controller.reason
     assert (found.errors <= found.column("bound")[found.beside]).all()
 
 

@@ -81,7 +81,7 @@ def test_a_log_without_a_weld(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
     recorder.flangeye_noted(step="0.acquire.live", name="where", value={"x": 1.0})
     recorder.close()
-    with pytest.raises(StageError, match="holds no step whose decisions can be made again"):
+    with pytest.raises(StageError, match="holds no step whose decisions can be repeated"):
         list(replay_steps(tmp_path / "run.mcap", load_registry()))
 
 

@@ -86,7 +86,7 @@ def test_a_way_that_would_drag_the_finger_through_the_work_is_refused() -> None:
 def test_an_arm_that_a_person_moves_cannot_weld() -> None:
     arm = Arm()
     vars(arm)["by_hand"] = True
-    with pytest.raises(DeviceError, match="is moved by hand; an arm that drives is needed"):
+    with pytest.raises(DeviceError, match="is moved by hand; an arm that flangeye can drive is"):
         run(planned("v-straight", end=SHORT), driver=driver_of(arm))
 
 
@@ -203,7 +203,7 @@ def test_an_arm_that_moves_unasked_is_stopped() -> None:
     for _ in range(5):
         drive.tick()
     robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
-    with pytest.raises(DeviceError, match="the arm moves without a command from here"):
+    with pytest.raises(DeviceError, match="the arm moves without a command of flangeye"):
         for _ in range(3000):
             robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
             drive.tick()

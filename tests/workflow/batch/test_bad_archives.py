@@ -77,7 +77,7 @@ CASES = {
         "ancorasir (holds none of calib_data.json, "
         "calibration_robot_pose_data.npy, calibration_robot_pose_data.npz, data.txt, "
         "readRobot.txt);* folder (holds clouds (5), but none of poses.csv, poses.yaml, poses.yml, "
-        "poses.json);* not tried, for a recipe must give their parameters: *",
+        "poses.json);* not tried, because a recipe must give their parameters: *",
     an_empty_list_of_poses: ": holds no poses",
     poses_without_clouds: "/00.pcd: does not exist",
     counts_that_differ:

@@ -151,7 +151,7 @@ def test_a_session_that_killed_its_worker_twice_is_not_started_again(work: Worke
     outcome = work.again()
     assert (outcome.status, outcome.reason) == ("crashed", WORKER_DIED)
     assert WORKER_DIED == (
-        "its worker died 2 times while it ran: killed, out of memory, or a crash in native code"
+        "the worker process died 2 times while running this session: killed, out of memory, or a crash in native code"
     )
 
 
@@ -172,7 +172,7 @@ def test_a_worker_without_the_shared_folder(work: Worker) -> None:
     elsewhere = replace(work.job, out=str(work.out / "elsewhere"))
     outcome = run_session(elsewhere, work.session, Recipes(elsewhere))
     assert outcome.status == "failed" and outcome.reason
-    assert "elsewhere: not there on worker " in outcome.reason
+    assert "elsewhere: does not exist on worker " in outcome.reason
     assert outcome.reason.endswith("must be on a file system that all workers share")
 
 

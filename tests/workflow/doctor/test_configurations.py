@@ -153,11 +153,11 @@ def test_an_arm_that_rests_while_the_other_moves_is_no_stale_pose() -> None:
 def test_what_cannot_show_is_said_with_the_reason() -> None:
     idle = examine(session_of("arm-2"), CHECKS).idle
     assert idle == {
-        "check.direction": "the poses of the camera's link follow from joint angles",
-        "check.convention": "the poses of the camera's link follow from joint angles",
-        "check.exchanged": "the poses of the camera's link follow from joint angles",
+        "check.direction": "the camera's poses are computed from joint angles, so recorded flange poses are not used",
+        "check.convention": "the camera's poses are computed from joint angles, so recorded flange poses are not used",
+        "check.exchanged": "the camera's poses are computed from joint angles, so recorded flange poses are not used",
         "check.axes": "the markers were found in images or clouds, whose frame is known",
         "check.flips": "no marker's whole pose was measured",
         "check.scatter": "no marker's whole pose was measured",
-        "check.tool": "a constant offset of what carries the camera is part of the answer",
+        "check.tool": "a constant offset of the camera's carrier is absorbed by the estimated camera pose",
     }

@@ -103,7 +103,7 @@ def test_both_in_the_same_wrong_unit() -> None:
     session = session_of("centres")
     both = replace(session, poses=scaled(session.poses, 1e3), centres=session.centres * 1e3)
     finding = only(both)
-    assert finding.what.endswith("m away, and in mm")
+    assert finding.what.endswith("m away, so they are in mm")
     assert "robot: {scale: 0.001}, target: {scale: 0.001}" in finding.fix
 
 
@@ -650,7 +650,7 @@ def test_a_scanner_whose_depths_are_wrong(factor: float) -> None:
     session = session_of("flange")
     along = np.array([1.0, 1.0, factor])
     finding = only(replace(session, centres=session.centres * along))
-    assert finding.name == "scale" and finding.what.endswith("times as far along its axis")
+    assert finding.name == "scale" and finding.what.endswith("times as long along its axis")
     ((x, y, z),) = [line["acquire.archive"]["stretch"] for line in finding.lines]
     assert x == y == 1.0 and abs(z * factor - 1) < 2e-3
 

@@ -82,8 +82,8 @@ def test_a_link_is_where_the_joints_have_it() -> None:
     with pytest.raises(StageError) as error:
         cell.graph([replace(seen, arm_joints={})])
     assert str(error.value) == (
-        "where arm_link3 was at observation 7 follows from the joint angles of 'arm', and there "
-        "are none: record them, and name the robot's model in the recipe"
+        "where arm_link3 was at observation 7 is computed from the joint angles of 'arm', which are "
+        "missing: record them, and name the robot's model in the recipe"
     )
 
 
@@ -117,7 +117,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         ),
         (
             TWO.replace("arm: ur5", "arm: {model: ur5, on: arm}"),
-            "r.yaml:2: cell: 'arm' is its own parent; everything leads to base",
+            "r.yaml:2: cell: 'arm' is its own parent; every frame must lead to base",
         ),
         (
             "robot: ur5\n" + TWO,

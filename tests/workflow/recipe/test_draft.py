@@ -145,7 +145,10 @@ def test_clouds_in_centimetres_are_known_by_the_flange(folder: Path) -> None:
     shutil.copy(SAMPLE / "poses.csv", folder)
     for path in SAMPLE.glob("*.pcd"):
         write_cloud(folder / path.name, read_cloud(path), "cm")
-    assert "assumed: unit of the clouds: cm, as in m or mm no scan shows the flange" in init()
+    assert (
+        "assumed: unit of the clouds: cm, because no scan shows the flange when read in m or mm"
+        in init()
+    )
     assert recipe(folder).steps[0].params.unit == "cm"
 
 
@@ -618,7 +621,7 @@ def two_poses_of_nobody(folder):
         (angles_of_nobody, [], "not known: rotation convention of columns rx, ry, rz of log.csv (ur, "
          "kuka, fanuc, abb, yaskawa, mitsubishi, epson, staubli, kawasaki, doosan, halcon, rpy, "
          "quaternion_xyzw, quaternion_wxyz, vector, xyz, ZYX, …); add --rotation vector, or --rotation xyz for roll, "
-         "pitch, yaw; or name the arm with --robot: its maker decides"),
+         "pitch, yaw; or name the arm with --robot: the maker's convention is then used"),
         (images, [], "not known: which printed target is seen; add --target 'charuco: "
          "{columns: 8, rows: 6, square: 30 mm, marker: 22 mm}'"),
         (arrays_of_nobody, [], "not known: which poses are the arm's (poses.npz:A, poses.npz:B); "

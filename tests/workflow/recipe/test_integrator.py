@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,17 @@ def kuka(turn: Rotation) -> list[float]:
     return turn.as_euler("ZYX", degrees=True).tolist()
 
 
+def fixed(turn: Rotation) -> list[float]:
+    """Return roll, pitch, yaw [deg]."""
+    return turn.as_euler("xyz", degrees=True).tolist()
+
+
 def record(
-    folder: Path, heading: str, angles: Callable[[Rotation], list[float]], scan: str
+    folder: Path,
+    heading: str,
+    angles: Callable[[Rotation], list[float]],
+    scan: str,
+    numbers: Sequence[int] = range(9, 33, 3),
 ) -> None:
     """Write the sample's scans as PLY and its poses as a robot's table in mm and degrees."""
     (folder / scan).parent.mkdir(parents=True)
@@ -36,8 +45,9 @@ def record(
     for k, row in enumerate(csv.DictReader((SAMPLE / "poses.csv").read_text().splitlines())):
         turn = Rotation.from_quat([float(row[f"q{axis}"]) for axis in "xyzw"])
         place = [1e3 * float(row[f"{axis}_m"]) for axis in "xyz"]
-        lines.append(separator.join(f"{x:.6f}" for x in (*place, *angles(turn))))
-        write_ply(folder / scan.format(number=3 * k + 9), SAMPLE / row["cloud"])
+        name = [f"p{k}"] if heading.startswith("name") else []
+        lines.append(separator.join([*name, *(f"{x:.6f}" for x in (*place, *angles(turn)))]))
+        write_ply(folder / scan.format(number=numbers[k]), SAMPLE / row["cloud"])
     (folder / "robot.csv").write_text("\n".join(lines) + "\n")
 
 
@@ -52,10 +62,12 @@ def write_ply(path: Path, source: Path) -> None:
 @pytest.mark.parametrize(
     ("heading", "angles", "scan", "guessed"),
     [
-        ("x,y,z,rx,ry,rz", vectors, "scan_{number:02d}.ply", "ur (--rotation changes it)"),
+        ("x,y,z,rx,ry,rz", vectors, "scan_{number:02d}.ply", "vector (arm and target turn alike"),
+        ("x,y,z,rx,ry,rz", fixed, "scan_{number:02d}.ply", "xyz (arm and target turn alike"),
         ("X;Y;Z;A;B;C", kuka, "scans/part_{number}.ply", "kuka (--rotation changes it)"),
+        ("name,x,y,z,a,b,c", kuka, "frame_{number}.ply", "no number in common"),
     ],
-    ids=["mm-and-degrees", "kuka-semicolons-subfolder-other-names"],
+    ids=["vector-in-degrees", "roll-pitch-yaw", "kuka-semicolons-subfolder", "other-names"],
 )
 def test_three_commands_lead_to_a_launch_file(
     heading: str, angles: Any, scan: str, guessed: str,
@@ -68,7 +80,7 @@ def test_three_commands_lead_to_a_launch_file(
     code, said, err = command("init", "cell", *words)
     assert code == 0, err
     assert guessed in said
-    assert "paired in order: row 1 with" in said
+    assert re.search("paired in order: (row 1|p0) with", said)
     for assumed in (
         "direction of the arm's poses",
         "what the scans show",
@@ -93,15 +105,30 @@ def test_a_wrong_convention_is_refused_with_the_right_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fixed = lambda turn: turn.as_euler("xyz", degrees=True).tolist()  # noqa: E731
     record(tmp_path / "cell", "x,y,z,rx,ry,rz", fixed, "scan_{number:02d}.ply")
     words = ["--robot", "ur5", "--scanner", "phoxi-m", "--yes", "--out", "cell.yaml"]
-    assert command("init", "cell", *words)[0] == 0
+    assert command("init", "cell", "--rotation", "vector", *words)[0] == 0
     code, said, _ = command("run", "cell.yaml", "--out", "first")
     assert code == 1
     read = "the robot's rotations were read as a rotation vector in degrees, and fit as roll, pitch"
     assert read in " ".join(said.split())
     assert "rotation: xyz" in said
+
+
+def test_scans_paired_in_a_wrong_order_are_refused_with_the_shift(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Call
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shifted = [102, 103, 104, 105, 106, 107, 108, 101]
+    record(tmp_path / "cell", "name,x,y,z,a,b,c", kuka, "frame_{number}.ply", shifted)
+    words = ["--robot", "ur5", "--scanner", "phoxi-m", "--yes", "--out", "cell.yaml"]
+    code, said, err = command("init", "cell", *words)
+    assert code == 0, err
+    assert "warning: poses and scans have no number in common" in said
+    code, said, err = command("run", "cell.yaml", "--out", "first")
+    assert code == 1
+    assert "warning: poses and scans have no number in common" in said + err
+    assert "each scan belongs to the pose 1 earlier" in said and "shift: -1" in said
 
 
 @pytest.mark.parametrize("table", [None, "X,Y,Z,A,B,C\n1,2,3,4,5,6\n"])

@@ -786,8 +786,7 @@ def test_joint_angles_are_no_poses_and_ask_for_their_arm(
     joints_alone(tmp_path / "rec", *session(SEED))
     told = CliRunner().invoke(commands(), ["init", "rec", "--yes", "--robot", "none"])
     assert str(told.exception) == (
-        "rec/robot.txt: 6 numbers a row; in no usual convention of poses does their rotation "
-        "agree with the target's; joint angles? name the arm: --robot NAME ('flangeye robots' lists them), or "
+        "rec/robot.txt: 6 numbers a row; their rotation agrees with the target's in no usual convention of poses; joint angles? name the arm: --robot NAME ('flangeye robots' lists them), or "
         "its .urdf; or say --rotation (kuka, vector, …)"
     )
 

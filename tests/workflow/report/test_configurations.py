@@ -107,7 +107,7 @@ def test_an_image_without_its_target_is_shown_with_the_reason(tmp_path: Path) ->
     view = missed_view(facts)
     assert (view.id, view.box) == ("2", (-0.5, -0.5, 320.0, 240.0))
     assert view.summary == (
-        "Capture 2, set aside: 4 corners found, at least 6 are needed. So it is with 1 more."
+        "Capture 2, set aside: 4 corners found, at least 6 are needed. 1 more captures were rejected by the fit."
     )
     assert "An image without its target" in page.render(facts.log)
     assert missed_view(logged(tmp_path / "s.mcap")) is None

@@ -94,7 +94,7 @@ def test_a_bar_that_dwarfs_the_others_is_cut_and_says_its_length(make_run: Make)
     (note,) = figure["layout"]["annotations"]
     assert note["x"] == "pose-08"
     assert 39 < float(note["text"].removesuffix("↑")) < 41
-    assert errors.summary.endswith("cut off and bear their length.")
+    assert errors.summary.endswith("cut off and labelled with their length.")
 
 
 def test_long_ids_that_start_alike_keep_labels_of_their_own(make_run: Make) -> None:

@@ -83,12 +83,12 @@ def test_the_paths_are_those_of_plan_seam_robot_tip_and_torch(logged: Callable[.
 
 def test_the_deviation_is_the_torch_s_beside_the_seam(logged: Callable[..., Any]) -> None:
     drawn = traces(weld_drawing(facts(logged(WELD))).deviation)
-    x, y = drawn["estimated, from the seam as felt"]
+    x, y = drawn["estimated torch, from the estimated seam"]
     assert x.min() >= 0.0
     np.testing.assert_allclose(y, 0.2, atol=1e-3)
-    np.testing.assert_allclose(drawn["true, from the true seam"][1], 0.1, atol=1e-3)
+    np.testing.assert_allclose(drawn["true torch, from the true seam"][1], 0.1, atol=1e-3)
     alone = traces(weld_drawing(facts(logged(WELD, scan=None))).deviation)
-    assert list(alone) == ["estimated, from the seam as felt"]
+    assert list(alone) == ["estimated torch, from the estimated seam"]
 
 
 def test_the_phases_are_bands_over_the_deflection(logged: Callable[..., Any]) -> None:
@@ -106,7 +106,7 @@ def test_speeds_and_the_loop_are_told_in_people_s_units(logged: Callable[..., An
     np.testing.assert_allclose(speeds["robot [mm/s]"][1], 5.0, rtol=1e-5)
     np.testing.assert_allclose(speeds["turning [deg/s]"][1], 5.73, rtol=1e-3)
     assert ("computing, 99 % below", "0.42 ms") in drawing.loop
-    assert ("answering by the clock, 99 % below", "0.61 ms") in drawing.loop
+    assert ("cycle start to command sent, 99 % below", "0.61 ms") in drawing.loop
     assert ("with the tag", "590") in drawing.loop
 
 
@@ -121,7 +121,7 @@ def test_the_page_says_why_a_weld_was_stopped(logged: Callable[..., Any]) -> Non
 def test_a_weld_that_felt_nothing_is_still_drawn(logged: Callable[..., Any]) -> None:
     nothing = replace(WELD, refined=np.zeros((0, 3)), mode="vision", loop={})
     drawing = weld_drawing(facts(logged(nothing)))
-    assert list(traces(drawing.deviation)) == ["true, from the true seam"]
+    assert list(traces(drawing.deviation)) == ["true torch, from the true seam"]
     assert [name for name, _ in drawing.loop] == ["images read", "with the tag"]
 
 
@@ -143,7 +143,7 @@ def test_believed_and_true_torch_are_shown_with_the_band(logged: Callable[..., A
             facts(logged(replace(WELD, band=band, true_torch=path(0.46, 1.4e-3))))
         ).deviation
     )
-    np.testing.assert_allclose(drawn["estimated, from the seam as felt"][1], 0.2, atol=1e-3)
-    np.testing.assert_allclose(drawn["true, from the true seam"][1], 0.3, atol=1e-3)
+    np.testing.assert_allclose(drawn["estimated torch, from the estimated seam"][1], 0.2, atol=1e-3)
+    np.testing.assert_allclose(drawn["true torch, from the true seam"][1], 0.3, atol=1e-3)
     np.testing.assert_allclose(drawn["95 % band"][1], 0.3, atol=1e-3)
     np.testing.assert_allclose(drawn["95 % band, right"][1], -0.3, atol=1e-3)

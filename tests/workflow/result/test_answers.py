@@ -110,14 +110,14 @@ def test_both_stand_side_by_side_with_the_error_to_expect() -> None:
 def test_the_console_gives_both() -> None:
     said = told(document(corrected(), FIGURES))
     assert (
-        "arm as it reports  (600.00, 0.00, 1000.00) mm, (180.000, 0.000, 0.000) deg; 0.361 mm"
+        "arm as reported    (600.00, 0.00, 1000.00) mm, (180.000, 0.000, 0.000) deg; 0.361 mm"
         in said
     )
     assert "arm corrected      (600.00, 3.00, 1000.00) mm" in said
     assert "joints 0.00, 4.00, -3.00, 5.00, 0.00, 0.00 mrad; in calibration.yaml" in said
     assert "held-out error     0.500 mm rms" in said
     assert "5 folds without 2 outliers; 0.400 mm rms with them" in said
-    assert "Two answers" not in told(document(calibration(), FIGURES))
+    assert "Two camera poses" not in told(document(calibration(), FIGURES))
 
 
 def test_the_calibration_file_carries_both() -> None:

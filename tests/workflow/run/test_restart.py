@@ -208,7 +208,7 @@ def test_decisions_are_made_again_where_a_part_can(
     registry: Registry, ended_early: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = ended_early(TOY_RECIPE + "  - seam.toy\n  - weld.by_halves\n")
-    with pytest.raises(StageError, match="holds no step whose decisions can be made again$"):
+    with pytest.raises(StageError, match="holds no step whose decisions can be repeated$"):
         list(replay_steps(folder, registry))
     part = registry.part
 

@@ -181,7 +181,7 @@ def _resting(poses: Floats) -> NDArray[np.intp]:
 def _require_rest(count: int, resting: str, moving: str) -> None:
     if count < 3:
         raise CalibrationRefused(
-            f"the {resting} arm stands still at {count} poses at most, and 3 are needed at which "
-            f"only the {moving} moves",
+            f"the {resting} arm stands still at no more than {count} poses; 3 poses at which only "
+            f"the {moving} arm moves are needed",
             "record such poses, or use solve.robust, which needs none",
         )

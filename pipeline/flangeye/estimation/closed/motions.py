@@ -53,7 +53,7 @@ def motions_of(carried: Floats, seen: Floats) -> Motions:
     if not kept.any():
         raise CalibrationRefused(
             f"all {len(a)} motions between poses turn by {np.degrees(turns.min()):.0f} deg or "
-            "more: the axis of half a turn may point either way",
+            "more: the sign of the axis of a half turn is not determined",
             "add poses in between",
         )
     return Motions(a[kept], b[kept], alpha[kept], beta[kept])

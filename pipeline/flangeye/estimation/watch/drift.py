@@ -284,7 +284,7 @@ def _windows(n: int, test: DriftTest) -> range:
 
 
 def _step(checks: Information, start: Prior, first: int, test: DriftTest) -> tuple[float, int]:
-    """Return a step's likelihood ratio over its threshold, and the check ``first``."""
+    """Return the test statistic of a step at check ``first`` over its threshold, and ``first``."""
     low = max(first - test.reference, 0)
     before = start.information.plus(checks.summed(low, first))
     after = checks.summed(first, len(checks.matrix))

@@ -294,13 +294,13 @@ class CompressedTable(PointTable):
             refuse(
                 self.path,
                 f"its header promises {math.prod(self.shape)} points ({whole} bytes), "
-                f"but its compressed data stands for {decompressed} bytes",
+                f"but its compressed data expands to {decompressed} bytes",
             )
         if compressed > found:
             refuse(self.path, f"truncated: {compressed} compressed bytes promised, it has {found}")
         # A token of three bytes writes 264 at most: more than that is not an LZF stream
         if decompressed > 88 * compressed:
-            refuse(self.path, f"{compressed} compressed bytes cannot stand for {decompressed}")
+            refuse(self.path, f"{compressed} compressed bytes cannot expand to {decompressed}")
 
     def decode(self) -> Points:
         """Decompress as far as the last of x, y and z, and no further."""

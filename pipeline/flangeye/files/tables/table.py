@@ -170,7 +170,7 @@ def rows_of(file: Path, document: TableDocument) -> list[Rows]:
     data = document.data
     if isinstance(data, np.ndarray):
         if data.ndim == 0:
-            raise StageError(f"{file}: is one number, expected rows of them")
+            raise StageError(f"{file}: holds a single number; rows of numbers are expected")
         one = data.shape in MATRIX_SHAPES or data.ndim == 1
         return [_columns(document.where, {"": data[None] if one else data})]
     if isinstance(data, list):

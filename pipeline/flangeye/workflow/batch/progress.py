@@ -240,7 +240,7 @@ class BatchProgress:
         if self._printed <= most:
             self.note(f"{outcome.status} {session}: {outcome.reason}")
         elif self._printed == most + 1:
-            self.note("further ones will be in sessions.csv")
+            self.note("further sessions without a calibration are listed in sessions.csv only")
 
 
 def count_text(counts: Mapping[Status, int]) -> str:

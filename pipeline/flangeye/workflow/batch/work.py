@@ -42,7 +42,8 @@ MAX_STARTS = 2
 """Largest number of starts of a session: its worker may have died for another reason."""
 
 WORKER_DIED = (
-    f"its worker died {MAX_STARTS} times while it ran: killed, out of memory, or a crash in "
+    f"the worker process died {MAX_STARTS} times while running this session: killed, out of "
+    f"memory, or a crash in "
     "native code"
 )
 STARTS = ".starts"
@@ -145,7 +146,8 @@ class Recipes:
         registry, host = _registry(), socket.gethostname()
         if self._job.place.read(READY) is None:
             raise StageError(
-                f"{self._job.out}: not there on worker {host}; the batch's folder must be on a "
+                f"{self._job.out}: does not exist on worker {host}; the batch's folder must be on "
+                f"a "
                 "file system that all workers share"
             )
         check_software(self._job.software, software_of(registry), host)

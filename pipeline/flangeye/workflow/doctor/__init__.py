@@ -67,7 +67,7 @@ def combined_fix(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
     wrong = "; and ".join(finding.what for finding in together)
     known = "; then ".join(filter(None, map(evidence_of, together)))
     steps = ["\n  ".join(sorted(lines.values()))] if len(lines) > 1 else together[-1].choices
-    return wrong, known and f"tried with that corrected: {known}", steps
+    return wrong, known and f"re-solved with the correction: {known}", steps
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:

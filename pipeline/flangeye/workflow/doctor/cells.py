@@ -152,7 +152,7 @@ def _edited(data: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
 
 
 def _recorded(observation: Observation, recording: Recording, cell: Cell) -> Observation:
-    """Return an observation with poses and target as they were recorded; of a scan, with poses."""
+    """Return an observation with poses and target as recorded, before any correction."""
     feature = observation.feature
     if isinstance(feature, PoseFeature) and recording.camera_T_target is not None:
         marker = Transform(CAMERA, TARGET, recording.camera_T_target)
@@ -319,7 +319,7 @@ def _exchanged(at: Keys, arms: Mapping[str, Table]) -> Iterator[Suspicion]:
             if own[key] != other[key]
         }
         if changes:
-            what = f"the poses of {one} are those of {two}, and the other way round"
+            what = f"the poses of {one} and {two} are exchanged"
             yield Suspicion("swapped arms", what, changes)
 
 

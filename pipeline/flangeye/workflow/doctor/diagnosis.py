@@ -130,7 +130,10 @@ class RecordedSession:
         """
         self.require_samples()
         if not self.uses_poses:
-            raise NotApplicable("the poses of the camera's link follow from joint angles")
+            raise NotApplicable(
+                "the camera's poses are computed from joint angles, so recorded flange poses are "
+                "not used"
+            )
 
     def where(self, mask: Mask) -> RecordedSession:
         """Return the samples of a mask."""

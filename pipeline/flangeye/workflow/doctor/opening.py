@@ -278,7 +278,7 @@ def _of_recordings(
 
 
 def _bound_with(reader: BoundPart, arm: Mapping[str, Any], target: Mapping[str, Any]) -> BoundPart:
-    """Return a reader with other parameters of its own, and of its target's."""
+    """Return a reader with other parameters for the poses and for the target's table."""
     changed: dict[str, Any] = dict(arm)
     of_target = getattr(reader.params, "target", None)
     if target and of_target is not None:

@@ -177,7 +177,7 @@ class RunLog:
         """
         if not self.gathered:
             self.require_sound()
-            raise StageError(f"{self.path}: the run ended early; nothing was gathered yet")
+            raise StageError(f"{self.path}: the run ended early; no capture was recorded")
 
     def text(self, name: str) -> str | None:
         """Return an attached text, such as ``recipe.yaml``; None if it is not attached."""

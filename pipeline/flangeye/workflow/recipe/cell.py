@@ -99,7 +99,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
         try:
             chain(_frames(section), name)
         except StageError:
-            yield (), f"'{name}' is its own parent; everything leads to base"
+            yield (), f"'{name}' is its own parent; every frame must lead to base"
 
 
 def _beyond_links(

@@ -240,7 +240,7 @@ def _stands(place: Place) -> tuple[Triple, Triple] | None:
 def _require_link(camera: str, context: Context) -> None:
     if RobotModel not in context:
         raise RecipeError(
-            "eye-on-arm: where a link is follows from the arm's kinematics; name the robot's model"
+            "eye-on-arm: a link's pose is computed by the arm's kinematics; name the robot's model"
         )
     robot: RobotModel | None = context[RobotModel]
     links = [f"{LINK}{i + 1}" for i in range(len(robot.joints) if robot else 0)]

@@ -133,7 +133,7 @@ class RobotSection(NamedSection):
                 "ur5e, with factory"
             )
         if not self.urdf and (self.base or self.packages):
-            raise ValueError("base and packages say where things are in a urdf; name it")
+            raise ValueError("base and packages belong to a urdf; name the urdf too")
         if not (self.model or self.urdf or self.flange):
             raise ValueError(
                 "name the arm: model: ur10e ('flangeye robots' lists them), urdf: arm.urdf, or, "

@@ -236,8 +236,8 @@ class _Checker:
             if asks and last and not getattr(last[0].params, "corrects_arm", False):
                 self.complain(
                     ("steps", step.index, step.stage.name, "arm"),
-                    f"the corrected arm is asked for, and {last[0].stage.name} gives the pose for "
-                    "the arm as its controller reports it alone; write arm: as-reported, or let "
+                    f"arm: corrected is requested, but {last[0].stage.name} gives the pose only "
+                    f"for the arm as its controller reports it; write arm: as-reported, or let "
                     "solve.robust find the arm's error, with no refine "
                     "step after it that changes the pose",
                 )
@@ -379,8 +379,9 @@ def _require_reached(path: Path, robot: RobotModel) -> None:
     poses = [arm.flange(low + share * (high - low)) for share in (0.3, 0.45, 0.6)]
     if not any(len(arm.inverse(pose)) for pose in poses):
         raise RecipeError(
-            f"{path}: robot: no joint angles of {robot.model} were found for {len(poses)} poses of "
-            "its own, so that it cannot be sent to a plan's; record poses by hand and read them: "
+            f"{path}: robot: no joint angles of {robot.model} were found for {len(poses)} poses "
+            f"computed from its own joint angles, so it cannot be driven to planned poses; record "
+            f"poses by hand and read them: "
             "robot: {flange: ISO 9409-1-50-4-M6}"
         )
 

@@ -218,7 +218,9 @@ def missed_view(facts: Facts) -> ImageView | None:
     for capture in facts.log.captures() if why else ():
         if capture.id in why and capture.image is not None:
             height, width = capture.image.pixels.shape[:2]
-            more = f" So it is with {len(why) - 1} more." if len(why) > 1 else ""
+            more = (
+                f" {len(why) - 1} more captures were rejected by the fit." if len(why) > 1 else ""
+            )
             summary = f"Capture {capture.id}, set aside: {why[capture.id]}.{more}"
             box = (-0.5, -0.5, float(width), float(height))
             return ImageView(

@@ -67,7 +67,7 @@ class Errors:
         )
         if max(self.residuals.values()) <= self.limit:
             return text
-        return f"{text} Bars far longer than those are cut off and bear their length."
+        return f"{text} Much longer bars are cut off and labelled with their length."
 
 
 def errors_of(facts: Facts) -> Errors:

@@ -125,7 +125,7 @@ def mapped(pose: Floats, xyz: Any) -> Floats:
 
 
 def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, float, str]:
-    """Return the true error at each point as lines, how much too long, and the largest."""
+    """Return true errors at points as lines, the lines' exaggeration, and the largest error."""
     truth, found = facts.result.truth, facts.estimate
     if truth is None or found is None:
         raise ValueError("there is no truth to compare with")

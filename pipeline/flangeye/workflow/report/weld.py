@@ -128,8 +128,8 @@ def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figu
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
     for name, line, torch, colour in (
-        ("estimated, from the seam as felt", weld.refined, weld.torch, SERIES["circle"]),
-        ("true, from the true seam", truth, true_torch, SERIES["truth"]),
+        ("estimated torch, from the estimated seam", weld.refined, weld.torch, SERIES["circle"]),
+        ("true torch, from the true seam", truth, true_torch, SERIES["truth"]),
     ):
         if line is not None and len(line) > 1:
             along, across, _ = _beside(plane, line, torch)
@@ -201,8 +201,8 @@ def _loop(weld: WeldReport) -> list[tuple[str, str]]:
         ("cycles", f"{loop.get('cycles', 0):.0f}"),
         ("computing, median", f"{loop.get('computing_median', 0) * 1e3:.2f} ms"),
         ("computing, 99 % below", f"{loop.get('computing_p99', 0) * 1e3:.2f} ms"),
-        ("answering by the clock, median", f"{loop.get('answering_median', 0) * 1e3:.2f} ms"),
-        ("answering by the clock, 99 % below", f"{loop.get('answering_p99', 0) * 1e3:.2f} ms"),
+        ("cycle start to command sent, median", f"{loop.get('answering_median', 0) * 1e3:.2f} ms"),
+        ("cycle start to command sent, 99 % below", f"{loop.get('answering_p99', 0) * 1e3:.2f} ms"),
         ("period, median", f"{loop.get('period_median', 0) * 1e3:.2f} ms"),
         ("period, 99 % below", f"{loop.get('period_p99', 0) * 1e3:.2f} ms"),
         ("images read", f"{weld.figures.get('images', 0):.0f}"),
@@ -301,9 +301,9 @@ def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
     told = facts.result.seam
     if told and told.truth:
         error = f"{millimetres(told.truth.rms)} mm rms, {millimetres(told.truth.max)} mm at most"
-        rows.append(("True error, of the simulation", error))
+        rows.append(("True error, known in simulation", error))
         rows.append(
-            ("Points of which the stated tube contains the true seam", f"{told.truth.inside:.0%}")
+            ("Points at which the true seam is inside the stated tube", f"{told.truth.inside:.0%}")
         )
     return rows
 
@@ -313,9 +313,9 @@ def _figure(name: str, value: float) -> tuple[str, str]:
     words, unit = {
         "seen": ("Visible share of the part's broadest side", "%"),
         "refuted": ("Share of the part that the scanner sees through", "%"),
-        "second": ("Score of the next best pose, of the best", "%"),
+        "second": ("Score of the second best pose, relative to the best", "%"),
         "explained": ("Share of points on the joint", "%"),
-        "coverage": ("Visible share of its length", "%"),
+        "coverage": ("Visible share of the seam's length", "%"),
         "residual": ("Distance of the scan from the surface", "mm"),
         "registration": ("Line in the scan, one sigma", "mm"),
         "start": ("Start along the seam, one sigma", "mm"),

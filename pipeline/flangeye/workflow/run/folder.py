@@ -132,10 +132,7 @@ def calibration_yaml(result: Result) -> str:
         "# For the arm as its controller reports it.\n"
     )
     if "corrected_arm" in document:
-        header += (
-            "# What stands under corrected_arm holds for the arm with that correction alone, never "
-            "without it.\n"
-        )
+        header += "# corrected_arm is valid only for an arm to which its correction is applied.\n"
     return header + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=110)
 
 

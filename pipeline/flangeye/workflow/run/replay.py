@@ -53,4 +53,4 @@ def replay_steps(log: Path, registry: Registry) -> Iterator[tuple[str, ReplayedS
         found = True
         yield step, part(log, step)
     if not found:
-        raise StageError(f"{log}: holds no step whose decisions can be made again")
+        raise StageError(f"{log}: holds no step whose decisions can be repeated")

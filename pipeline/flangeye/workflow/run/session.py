@@ -79,7 +79,7 @@ def record_scans(
     runner = Runner(recipe, registry, ArchivePath(), motion)
     with _logged(recipe, registry, folder) as recorder:
         taken = runner.take(count)
-        recorder.ended(f"{len(taken)} scans were asked for, without a calibration")
+        recorder.ended(f"{len(taken)} scans were requested, without a calibration")
 
 
 @contextmanager

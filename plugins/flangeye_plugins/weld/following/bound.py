@@ -32,8 +32,11 @@ REMEDIES = {
         "torch_sigma, arm_sigma and distortion",
         "calibrate the tool, or add a 'profiler' behind it",
     ),
-    "askew": ("along_sigma, as the tool is askew", "measure it: flangeye tactile calibrate --body"),
-    "tip": ("tip_sigma, as the tool turns", "measure it: flangeye tactile calibrate --body"),
+    "askew": (
+        "along_sigma, because the tool is askew to the seam",
+        "measure it: flangeye tactile calibrate --body",
+    ),
+    "tip": ("tip_sigma, because the tool turns", "measure it: flangeye tactile calibrate --body"),
     "felt": ("the finger's gain and play, and the weave", "weld faster, or lower 'deflection'"),
 }
 """For each part of the variance: what it consists of, and how to reduce it."""

@@ -214,7 +214,7 @@ class Follower:
             self._stop(self._blind(coming))
 
     def _enter(self, pose: ToolPose) -> None:
-        """Start to follow once the tip, set down inside the felt start, is seated again.
+        """Start to follow once the tip, set down inside the seam's start, is seated.
 
         If the tip finds no seat there, the start is moved farther into the seam.
         """
@@ -296,8 +296,8 @@ class Follower:
         if self.phase in ("following", "bridging") and self._aside(pose) > 0.7:
             return (
                 f"the plan curves with a radius of {1e3 / abs(plan.bend(self.tip)):.1f} mm "
-                "and the arm is off towards its centre: the tip's place along it is not "
-                "observable; plan it better, or raise 'corner_radius'"
+                "and the arm is off towards its centre: the tip's position along the seam is not "
+                "observable; plan the seam more accurately, or raise 'corner_radius'"
             )
         if sensing.search.bent:
             return "the tip is displaced though nothing should touch it"

@@ -114,7 +114,7 @@ def _checked(
         )
     if len({type(o.feature) for o in (*seen, *stored.used)}) > 1:
         raise StageError(
-            f"{path}: shows another target than the calibration's, which checks nothing"
+            f"{path}: shows another target than the calibration's, so nothing is checked"
         )
     _refuse_own(path, prints_of(seen) & prints_of(stored.used))
     return MonitorCheck(str(path), tuple(seen), time_ns)

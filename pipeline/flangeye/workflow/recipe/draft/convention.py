@@ -416,7 +416,7 @@ def _store_mounting(
 
 
 def _measured(poses: Floats, marks: Floats, target: PoseColumns, questions: Questions) -> Floats:
-    """Return poses from images alone in metres, and store what corrects them."""
+    """Return poses from images alone in metres, and store the scale and axes that correct them."""
     inverse = bool(target.frames and is_inverse(target.frames))
     size = size_of(poses, inverted(marks) if inverse else marks)
     if size is None:
@@ -425,14 +425,14 @@ def _measured(poses: Floats, marks: Floats, target: PoseColumns, questions: Ques
     if target.axes_of_motion != "optical":
         questions.mended["axes"] = target.axes_of_motion
     questions.assumed.append(
-        f"{target.table.name}: poses from images alone have no unit of length; theirs is "
-        f"{size:.4g} m by the arm's motion, with a camera in its hand (its scale changes it)"
+        f"{target.table.name}: poses from images alone have no scale; by the arm's motion one unit "
+        f"is {size:.4g} m, for a camera in hand (the target's scale: in the recipe changes it)"
     )
     return scaled(marks, np.full(3, size))
 
 
 def _orders(pose: PoseColumns, questions: Questions, prefix: str) -> list[PoseColumns]:
-    """Return a pose as it was found, and six numbers without names with the rotation first too."""
+    """Return a pose's possible column orders; unnamed ones may have the rotation first."""
     if not pose.may_be_joints or pose.rotations or questions.given.get(f"{prefix}columns"):
         return [pose]
     turned = replace(pose, columns=(*pose.columns[3:], *pose.columns[:3]), guess=TURN_FIRST)
@@ -471,8 +471,8 @@ def _within_reach(arm: PoseColumns, robot: RobotModel | None) -> PoseColumns:
 def _neither(arm: PoseColumns, robot: RobotModel | None) -> str:
     named = f" nor as joint angles of {robot.model}" if robot else f"; joint angles? {NAME_THE_ARM}"
     return (
-        f"{arm.table.file}: {len(arm.columns)} numbers a row; in no usual convention of "
-        f"poses does their rotation agree with the target's{named}; or say --rotation (kuka, "
+        f"{arm.table.file}: {len(arm.columns)} numbers a row; their rotation agrees with the "
+        f"target's in no usual convention of poses{named}; or say --rotation (kuka, "
         "vector, …)"
     )
 
@@ -553,15 +553,39 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
         # without names
         likely = ("kuka", "quaternion_xyzw", "xyzw")
         usual = pose.rotations[0] if pose.rotations[0] in likely else None
+    if not prefix and usual and key not in questions.likely:
+        usual = _usual_in_its_unit(pose, usual, questions)
     shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""
     known = f"{', '.join(CONVENTIONS)}, vector, xyz, ZYX, …{joints}"
     question = f"rotation convention of columns {shown} of {pose.table.name}"
     example = f"vector, or --{key} xyz for roll, pitch, yaw"
     if not prefix:
-        example += "; or name the arm with --robot: its maker decides"
+        example += "; or name the arm with --robot: the maker's convention is then used"
     names = one_of(*CONVENTIONS, *PLAIN, "point", "joints", MATRIX, APART)
     return questions.ask(key, question, usual, example, names, known)
+
+
+def _usual_in_its_unit(pose: PoseColumns, usual: str, questions: Questions) -> str:
+    """Return the likely convention of an arm, whose maker's may not be that of these numbers.
+
+    Numbers in degrees where the maker writes radians come from another program: a UR's rotation
+    vector converted to degrees, or roll, pitch and yaw under the same names. Scans should decide.
+    A rotation vector is never longer than half a turn, so longer rows are angles.
+    """
+    numbers = _numbers(pose)
+    unit, own = _angle(numbers, pose), CONVENTIONS[usual].angle
+    if unit == own or not _has_angles(usual):
+        return usual
+    questions.rivals = usual_rotations()
+    told = f"{usual} writes {own}, and these are {unit}"
+    longest = np.nanmax(np.linalg.norm(numbers[:, 3:6], axis=1), initial=0.0)
+    half_turn = 180.5 if unit == "deg" else np.pi + 0.01  # written with few digits
+    if CONVENTIONS[usual].rotation == "vector" and longest > half_turn:
+        told = f"a row of {longest:.0f} {unit} is no rotation vector, so roll, pitch, yaw"
+        usual = "xyz"
+    questions.likely["rotation"] = (usual, told)
+    return usual
 
 
 def _length(numbers: Floats, pose: PoseColumns) -> str:

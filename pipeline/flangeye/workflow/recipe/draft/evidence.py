@@ -380,7 +380,7 @@ def mounting_of(
         return None
     beyond = f", the next to {1e3 * others[0][0]:.0f} mm" if others else ""
     twin = next(((c, t) for c in cameras for t in targets if c != camera and t != way), None)
-    same = f"; so does {twin[0]} with {twin[1]}, the same equation" if twin else ""
+    same = f"; {twin[0]} with {twin[1]} has the same equation" if twin else ""
     return Mounting(camera, way, f"fits to {1e3 * best:.1f} mm{beyond}{same}")
 
 

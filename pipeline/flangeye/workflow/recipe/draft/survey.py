@@ -45,6 +45,7 @@ class Questions:
         likely: Likely answers from the data with their evidence, by option.
         mended: What corrects the target's poses, as ``reader.corrected`` takes it.
         open: Option of the question that neither data nor a person answered; empty without one.
+        rivals: Rotation conventions among which scans should decide, if the assumed one is unsure.
     """
 
     given: dict[str, str | None] = field(default_factory=dict)
@@ -53,6 +54,7 @@ class Questions:
     likely: dict[str, tuple[str, str]] = field(default_factory=dict)
     mended: dict[str, Any] = field(default_factory=dict)
     open: str = ""
+    rivals: Sequence[str] = ()
 
     def ask(
         self,

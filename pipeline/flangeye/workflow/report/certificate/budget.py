@@ -251,7 +251,7 @@ def shares_of(result: Result) -> list[Share]:
         each = f"{len(told) - len(rows)} causes of less than {least:.0%} of the variance each"
         shares.append(Share("others", np.sqrt(small), each))
     if rest > 0:
-        few = "how large each cause is, is estimated from few poses"
+        few = "the size of each cause is estimated from few poses"
         shares.append(Share("sizes of these causes", np.sqrt(rest), few))
     return sorted(shares, key=lambda share: -share.standard)
 
@@ -307,7 +307,7 @@ def _of_one_pose(result: Result) -> list[Contribution]:
     hidden = _standard_error(held.rms**2, int(3 * poses))
     beyond = held.rms**2 - float(own)
     standard = np.sqrt(max(beyond, hidden) / 3)
-    evidence = f"held-out error {held.rms * 1e3:.3f} mm rms beyond the calibration's own"
+    evidence = f"held-out error {held.rms * 1e3:.3f} mm rms, less the calibration's own part"
     rows = _each_axis("Arm and scan at one pose", "A", standard, evidence, 3 * poses)
     return [replace(row, bound=beyond < hidden) for row in rows]
 
