@@ -202,6 +202,7 @@ def picture_of(cloud: Floats, flange: Floats) -> str:
         rays = cloud[:, :2] / cloud[:, 2:]
         low, high = rays.min(axis=0), rays.max(axis=0)
         scale = (np.array(SHOT) - 2) / max(float((high - low).max() / (SHOT[0] / SHOT[1])), 1e-9)
+        # Far points first, so that near ones cover them
         depth = np.argsort(-cloud[:, 2])
         shade = np.interp(cloud[:, 2], np.quantile(cloud[:, 2], [0.02, 0.98]), [235, 70])
         # Colour of the flange in it: blue, green, red.
@@ -209,6 +210,7 @@ def picture_of(cloud: Floats, flange: Floats) -> str:
             at = ((points[:, :2] / points[:, 2:] - low) * scale.min()).astype(int)
             inside = ((at >= 0) & (at < np.array(SHOT) - 1)).all(axis=1)
             values = np.broadcast_to(colour, (len(points), 3))[inside]
+            # Squares of 2 x 2 pixels close the gaps between thinned points
             for x, y in ((0, 0), (0, 1), (1, 0), (1, 1)):
                 image[at[inside, 1] + y, at[inside, 0] + x] = values
     return _as_address(image)

@@ -125,6 +125,7 @@ class Project:
 
     def done(self) -> set[str]:
         """Return the steps that are done: of the recipe, and of the newest run."""
+        # A recipe with mistakes undoes its own steps, not those of a run that exists
         sound = self.check()[0] is not None
         newest = next(iter(self.runs()), None)
         found = {"Cell", *({"Poses"} if self.planned == self.text or newest else ())}
@@ -168,6 +169,7 @@ class Project:
         """Run a flangeye command that moves nothing in the folder, and return its output."""
         line = [sys.executable, "-P", "-m", "flangeye.cli", *words]
         try:
+            # Another process: a command that hangs or crashes must not take the pages with it
             done = subprocess.run(
                 line, cwd=self.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True,
                 timeout=patience,
@@ -201,6 +203,7 @@ class Project:
             before = kinds.index(kind) + KINDS[kind].several
             at = next((i for i, rank in enumerate(ranks) if rank >= before), len(steps))
             replaced = not KINDS[kind].several and kinds.index(kind) in ranks
+            # An empty slice inserts, one of length 1 replaces
             steps[at : at + replaced] = [{name: dict(params)}]
         self.edit({**data, "steps": steps})
 

@@ -342,8 +342,8 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
                 scene.lines(edge, SERIES["circle"])
         times = _residuals(scene, facts)
         ui.label(
-            f"{fits} red, in the base; residuals as arrows, {times:.0f} times their length: "
-            "green of poses that were used, orange of others."
+            f"{fits} red, in the base; arrows: residuals drawn {times:.0f} times as long, green "
+            f"for used poses, orange for unused ones."
         ).classes("note")
 
 

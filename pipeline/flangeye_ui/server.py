@@ -182,11 +182,13 @@ class Keys:
         self._sessions.append(secrets.token_urlsafe(24).encode())
         self._issued(self.token)
         value = self._sessions[-1].decode()
+        # HttpOnly: no script reads it; SameSite=Strict: no other page sends it
         return f"{self._cookie}={value}; HttpOnly; SameSite=Strict; Path={self.path}"
 
     def known(self, headers: Headers) -> bool:
         """Return whether one of the cookies belongs to a browser that has signed in."""
         given = list(cookies(headers, self._cookie))
+        # Compared in constant time, so that answers leak no part of a session's secret
         return any(secrets.compare_digest(g, s) for g in given for s in self._sessions)
 
 
@@ -254,6 +256,7 @@ class Gate:
 
     def _inside(self, scope: Scope) -> Scope:
         """Return the request for the pages, without cookies and with the server's prefix."""
+        # A client must not choose the prefix from which the pages build their links
         hidden = (b"cookie", b"x-forwarded-prefix")
         headers = [(k, v) for k, v in scope["headers"] if k.lower() not in hidden]
         return {**scope, "headers": headers, "root_path": self._keys.path}

@@ -244,7 +244,7 @@ class HandGuide:
     def __init__(
         self, robot: Robot, ask: Callable[[str], None], look: Callable[[], list[TagReading]]
     ) -> None:
-        """Take the arm, the prompt, and what reads the finger where the arm now stands."""
+        """Take the arm, the prompt, and a function that reads the finger at the present pose."""
         self._robot, self._ask, self._look = robot, ask, look
 
     def tip(self, finger: Finger, calibration: Calibration) -> Pivot:

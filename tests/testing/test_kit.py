@@ -572,7 +572,7 @@ CASES = [
         "scanner",
         "test_an_exposure_has_its_time",
         bad.scanner(bad.Plate, expose=at_time(lambda: 0, lambda: 1)),
-        "began before it was asked for",
+        "began before expose",
         {},
     ),
     (

@@ -801,7 +801,7 @@ def test_residuals_are_arrows_in_3d(browser: Any, served: Served, finished: Path
     page = opened(browser, served)
     page.goto(f"{page.url}result?run={finished.name}")
     page.get_by_text("In 3D: fitted rims and residuals").click()
-    note = page.get_by_text("Fitted rims red, in the base; residuals as arrows, ")
+    note = page.get_by_text("Fitted rims red, in the base; arrows: residuals drawn ")
     note.wait_for()
     facts = Project(served.folder, load_registry(), MoveCodes(print)).read(finished)
     longest = max(
@@ -809,7 +809,7 @@ def test_residuals_are_arrows_in_3d(browser: Any, served: Served, finished: Path
         for each in facts.measured
         if each.residual_in_base and each.used
     )
-    times = float(re.search(r"arrows, (\d+) times", note.inner_text())[1])  # type: ignore[index]
+    times = float(re.search(r"drawn (\d+) times", note.inner_text())[1])  # type: ignore[index]
     assert 0.1 <= times * longest <= 0.3
     page.locator(".scene").last.evaluate("box => box.scrollIntoView({block: 'center'})")
     page.wait_for_timeout(2000)

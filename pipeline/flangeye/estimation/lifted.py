@@ -121,7 +121,7 @@ class Pattern(NamedTuple):
         return self.at[:, 1 + 12 * k : 13 + 12 * k]
 
     def factors(self, places: Floats) -> tuple[Floats, Floats]:
-        """Return (1, rotation of the first) and (1, entries of the others)."""
+        """Return (1, rotation entries of U) and (1, all entries of each V multiplied with U)."""
         each = [np.append(p[:3, :3], p[:3, 3]) for p in places[list(self.after)]]
         return np.append(1.0, places[self.first, :3, :3]), np.concatenate([np.ones(1), *each])
 

@@ -357,8 +357,8 @@ def _with_walk(session: Session) -> Session:
     again = estimate(replace(problem, walk=walk), found.places, found.effects, found.inliers)
     return replace(session, found=again).noted(
         Warn(
-            "what the camera sees drifts from pose to pose, as visual odometry does: each pose is "
-            "compared with those before it",
+            "the measured poses drift from one to the next, as visual odometry does: each is "
+            "compared with the ones before it",
             "check that camera and target do not move by themselves, or look at a fixed target",
         )
     )

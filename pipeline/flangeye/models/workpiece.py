@@ -156,11 +156,14 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
     # Largest CAD file [bytes]: five million triangles
     vertices, triangles = _decoded(path, read_regular(path, 256_000_000))
     if triangles.ndim != 2 or not len(triangles):
-        raise StageError(f"{path}: holds no triangles; is it a mesh, and whole?")
+        raise StageError(f"{path}: holds no triangles; is it a mesh, and is the file complete?")
     if not np.isfinite(vertices).all():
         raise StageError(f"{path}: holds vertices that are not finite")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise StageError(f"{path}: has a triangle whose corner is not a vertex of it; is it whole?")
+        raise StageError(
+            f"{path}: has a triangle with a corner that is not among its vertices; is the file "
+            f"complete?"
+        )
     return vertices, triangles.astype(np.int32)
 
 

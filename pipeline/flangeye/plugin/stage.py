@@ -286,6 +286,7 @@ class BoundPart:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the part's function; its parameters are already there."""
+        # A part declares by its arguments what else it needs; most need their parameters alone
         extra: dict[str, Any] = {} if self.params is None else {"params": self.params}
         if self.offered is not None and "siblings" in self.part.needs:
             extra["siblings"] = self.offered.siblings(self.part)

@@ -279,10 +279,10 @@ class ScannerConformance(DriverConformance):
             scan = self.scanned(scanner)
             after = time.monotonic_ns()
         slack = LATE * 1e9
-        require(scan.started_ns >= before - slack, "the exposure began before it was asked for")
+        require(scan.started_ns >= before - slack, "the exposure began before expose() was called")
         require(
             scan.started_ns <= scan.ended_ns <= after,
-            "the exposure ended before it began, or later",
+            "the exposure's end is before its start, or after expose() returned",
         )
 
     def test_scans_follow_each_other(self) -> None:

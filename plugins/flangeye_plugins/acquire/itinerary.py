@@ -92,6 +92,7 @@ class Itinerary:
 
     def stops(self) -> Iterator[Stop]:
         """Yield the stops in order; an adaptive plan chooses each one on demand."""
+        # Verification first: the session ends as soon as the solver has enough calibration poses
         for index, pose in enumerate(self._checks):
             yield Stop(f"{index:04d}", "verification", pose)
         for index, pose in enumerate(self._plan.poses, len(self._checks)):

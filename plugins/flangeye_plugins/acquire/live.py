@@ -209,6 +209,7 @@ def _offline(
     Raises:
         StageError: The parameter ``home`` has another number of joints than the arm.
     """
+    # A resumed run starts where its last capture left the arm, if nobody has moved it since
     if resumed is not None and resumed.joints is not None:
         return resumed.joints, "offline: the plan begins where the arm stood at its last capture"
     if params.home is None:
@@ -292,6 +293,7 @@ class LiveSession:
 
     def _way(self, stop: Stop) -> Route | NoRoute:
         if self.passive:
+            # Only a goal to show: whoever moves the arm chooses the path and the speed
             return Route((Leg(stop.pose.joints, 1.0, 1.0, 0.0),))
         return self.itinerary.way(self.arm.state.joints, stop)
 
@@ -304,6 +306,7 @@ class LiveSession:
                 transfer = self.scanner.received_scan(began)
             else:
                 transfer = self.scanner.expose()
+        # A lost exposure costs one pose, not the session
         except FrameDropped as dropped:
             return partial(_rejected, stop, str(dropped))
         finally:

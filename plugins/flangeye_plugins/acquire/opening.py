@@ -302,7 +302,7 @@ def _cure(arm: Arm, joints: Floats, pose: Floats) -> str:
     cures = {
         "write joint_unit: deg": (np.radians(joints), pose),
         "write joint_unit: rad": (np.degrees(joints), pose),
-        "write pose: the other way round": (joints, inverted(pose)),
+        "invert the direction stated as pose:": (joints, inverted(pose)),
         "write length: mm": (joints, scaled(pose, 1e-3)),
         "write length: m": (joints, scaled(pose, 1e3)),
     }

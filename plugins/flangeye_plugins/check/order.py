@@ -69,7 +69,9 @@ def order(session: RecordedSession) -> Findings:
     if not helps(session.where(found.known), corrected_session):
         return
     if evidence.which == len(tried):
-        what = "the poses stand in the opposite order of the scans: the first belongs to the last"
+        what = (
+            "the poses are in the opposite order of the scans: the first belongs to the last scan"
+        )
         yield evidence.finding("poses backwards", what, corrected_session)
         return
     what = _said(session, *tried[evidence.which])

@@ -216,7 +216,7 @@ def size(session: RecordedSession) -> Findings:
     session.require_samples()
     marker = bool(np.isfinite(session.rotations).any())
     if not marker and not np.isfinite(session.places).all():
-        raise NotApplicable("neither a marker's pose was measured, nor where the target stands")
+        raise NotApplicable("neither a marker's pose nor the target's position was measured")
     null = fit_of(session)
     kinds = [*ALONG] if marker or session.acquire == "acquire.archive" else ["size"]
     factors = {kind: _factor(session, null, ALONG[kind]) for kind in kinds}

@@ -105,6 +105,7 @@ def easy_handeye2(pose: CalibratedPose, params: FramesParams) -> ExportedFile:
     document = {
         "parameters": {
             "name": params.name,
+            # Frames that the other mounting does not use still need a name in the file
             "calibration_type": "eye_on_base" if pose.stands else "eye_in_hand",
             "robot_base_frame": carrier if pose.stands else "base",
             "robot_effector_frame": "flange" if pose.stands else carrier,
@@ -132,7 +133,9 @@ class _OpenCvDumper(yaml.SafeDumper):
 
 
 _OpenCvDumper.add_representer(
-    _Matrix, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:opencv-matrix", data)
+    # Written as !!opencv-matrix, by which FileStorage knows a matrix
+    _Matrix,
+    lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:opencv-matrix", data),
 )
 
 

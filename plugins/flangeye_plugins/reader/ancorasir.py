@@ -117,6 +117,7 @@ def read_kinect(folder: Path) -> Archive:
 
 
 def _kinect_verification(file: Path, cloud: Path) -> Recording:
+    # new.txt has the centre in its first line and the TCP in its second
     centre = read_table(file, 3, slice(0, 1))[0]
     row = read_table(file, 6, slice(1, 2))[0]
     pose = pose_from_rotation_vector(f"{file}: row 2", row[:3] * MM, row[3:])
@@ -155,6 +156,7 @@ def _sample_recording(where: str, key: str, entry: Any, cloud: Path) -> Recordin
 def _sample_clouds(folder: Path) -> list[Path]:
     """Return one cloud per number; coloured copies have the same points in another order."""
     chosen: dict[str, Path] = {}
+    # In order of preference, as setdefault keeps the first
     for ending in ("_tool.ply", "_tool_valid.pcd", "_tool_valid.ply"):
         for path in folder.glob(f"*{ending}"):
             chosen.setdefault(path.name.removesuffix(ending), path)

@@ -192,6 +192,7 @@ def _delay(
     if (np.diff(times) <= 0).any():
         raise StageError(f"{archive.root}: delay: the poses' times do not rise")
     wanted = times + params.delay
+    # Poses are interpolated between recorded ones, never extrapolated beyond them
     kept = (wanted >= times[0]) & (wanted <= times[-1])
 
     def moved(rows: Floats) -> Floats:

@@ -129,6 +129,7 @@ def _scan(root: Path, name: str) -> Path:
     """Return the path of a scan beside the poses, or in the only folder there that has it."""
     if exists(root / name):
         return root / name
+    # With the name in two folders, as of two cameras, either one would be a guess
     inside = [folder / name for folder in root.glob("*/") if exists(folder / name)]
     return inside[0] if len(inside) == 1 else root / name
 

@@ -337,6 +337,7 @@ class Scans:
         looks = self._sound(self.first, range(len(self.times)), lambda _, message: _look(message))
         if len({look.shape for look in looks.values()}) != 1:  # clouds of changing size
             return None
+        # The correlation needs the course in time only, so any measure of change will do
         changes = [float(np.abs(b - a).mean()) for a, b in pairwise(looks.values())]
         times = self.times[list(looks)]
         return turning(*arm), ((times[1:] + times[:-1]) / 2, np.array(changes))
@@ -402,6 +403,7 @@ class Scans:
 def _look(message: Any) -> Floats:
     """Return a coarse sample of a cloud's depths or an image's pixels."""
     if hasattr(message, "fields"):
+        # A prime step crosses all columns of an organised cloud, whatever its width
         return np.asarray(np.nan_to_num(cloud_of(message)[..., 2].ravel()[::97]), dtype=float)
     return np.asarray(pixels_of(message)[::16, ::16], dtype=float)
 

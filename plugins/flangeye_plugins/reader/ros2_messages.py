@@ -250,6 +250,7 @@ class BagFrames:
     def take(self, message: Any, static: bool) -> None:
         """Add the transforms of a ``tf2_msgs/TFMessage``."""
         for each in message.transforms:
+            # ROS 1 began names with a slash, and bags converted from it still do
             child = each.child_frame_id.lstrip("/")
             stamp = each.header.stamp
             times, poses = self.samples.setdefault(child, ([], []))
@@ -287,6 +288,7 @@ class BagFrames:
             raise StageError(f"tf: no chain of transforms leads from '{parent}' to '{child}'")
         legs = up[: up.index(common)], down[: down.index(common)]
         times = self._times([*legs[0], *legs[1]])
+        # parent_T_child = inv(common_T_parent) common_T_child
         return times, np.linalg.inv(self._at(legs[1], times)) @ self._at(legs[0], times)
 
     def _times(self, frames: Sequence[str]) -> Floats:

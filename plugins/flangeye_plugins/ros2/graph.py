@@ -460,7 +460,7 @@ def arm_driver(
 ) -> dict[str, Any]:
     """Return the recipe's entry for an arm's driver with its parameters."""
     listening = controllers_in(topics)
-    question = "which controller moves the arm; none: others do, by hand or by a program"
+    question = "which controller moves the arm (none: it is moved by hand or by another program)"
     told = f" ({', '.join(listening)})" if len(listening) > 1 else ""
     chosen = ask("trajectory", question + told, _only(listening, "none"))
     params: dict[str, Any] = {"joints": list(joints)}

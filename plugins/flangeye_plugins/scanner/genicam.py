@@ -86,6 +86,7 @@ def configure(nodes: Any) -> RangeLayout:
     _enable_range(nodes)
     _write(nodes, "Scan3dOutputMode", ORGANISED)
     _write(nodes, "Scan3dDistanceUnit", "Millimeter")
+    # Three 32-bit floats a point, as the GenICam PFNC names it
     _write(nodes, "PixelFormat", "Coord3D_ABC32f")
     if has_node(nodes, "TriggerSoftware"):
         _write(nodes, "TriggerSelector", "FrameStart")
@@ -145,6 +146,7 @@ def _row(values: tuple[float, ...]) -> NDArray[np.float32]:
 def _axis(nodes: Any, axis: str) -> tuple[float, float, float]:
     """Return scale, offset, and the value of a missing measurement for an axis."""
     _write(nodes, "Scan3dCoordinateSelector", axis)
+    # GenICam SFNC, 3D scan control: without the flag no value marks a missing point
     flagged = _read(nodes, "Scan3dInvalidDataFlag", default=False)
     invalid = _read(nodes, "Scan3dInvalidDataValue", default=np.nan) if flagged else np.nan
     return (

@@ -111,6 +111,7 @@ class Realsense(OpenScanner):
 
     def _run_out(self) -> None:
         """Play a recording to its end, because the SDK may abort if it is stopped while reading."""
+        # A recording may be long, and close() must end
         limit = time.monotonic() + PATIENCE
         with contextlib.suppress(RuntimeError):
             while time.monotonic() < limit:

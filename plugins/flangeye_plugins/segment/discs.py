@@ -316,8 +316,9 @@ def _missing_plate(disc: Disc, nearby: Floats, flange: Flange) -> str | None:
     if abs(height - wanted) < 0.5 * wanted:
         return None
     return (
-        f"a disc {disc.across * 1e3:.0f} mm across has no plate {wanted * 1e3:.1f} mm before it, "
-        f"its middle stands {height * 1e3:.1f} mm out"
+        f"a disc {disc.across * 1e3:.0f} mm across has no plate {wanted * 1e3:.1f} mm in front of "
+        f"it; "
+        f"its middle is {height * 1e3:.1f} mm out"
     )
 
 

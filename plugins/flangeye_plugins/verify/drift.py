@@ -52,7 +52,7 @@ def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
         "statistic": found.statistic,
     }
     if found.state == "OK":
-        return Verification(True, f"the cell stands where {stored.path} found it", figures)
+        return Verification(True, f"scanner and arm are where {stored.path} found them", figures)
     return Verification(
         False, f"the cell has moved since {stored.path}, by {shift}", figures,
         advice="put the scanner back; or take verify.drift out of the recipe and use the new pose",

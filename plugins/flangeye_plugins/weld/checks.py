@@ -158,7 +158,7 @@ def check_seam(seam: Seam, surface: WorkSurface, distance: float, settings: Foll
     if crooked > np.radians(60.0):  # beyond, the torch would be pushed
         raise StageError(
             f"weld.tactile: the seam is too curved for a torch {distance * 1e3:.0f} mm behind "
-            f"the tip: the tool would stand at {np.degrees(crooked):.0f} deg to it, limit "
+            f"the tip: the tool would be at {np.degrees(crooked):.0f} deg to it, limit "
             "60 deg; end the plan before the bend, or take a tool whose torch "
             "is nearer to its tip"
         )

@@ -66,7 +66,7 @@ def test_what_the_sweep_finds_is_pressed_less_and_welded_within_its_bound(name: 
     ("name", "message"),
     [
         ("groove half angle 60 deg, known", "climb the wall.*lower 'deflection' to 1.24 mm"),
-        ("torch 0.5 mm aside", "torch is known to 1.16 mm at best at 106 mm.*calibrate the tool"),
+        ("torch 0.5 mm aside", "torch is known to 1.16 mm at best, 106 mm.*calibrate the tool"),
         ("arm wavy 0.3 mm", "most of it torch_sigma, arm_sigma and distortion"),
     ],
 )

@@ -186,7 +186,7 @@ def test_what_is_not_of_the_cell_is_named(tables: Path, change: Any, told: str) 
     ("stated", "cure"),
     [
         ({"joint_unit": "deg"}, "write joint_unit: rad"),
-        ({"pose": "flange_T_base"}, "write pose: the other way round"),
+        ({"pose": "flange_T_base"}, "invert the direction stated as pose:"),
         ({"length": "mm"}, "write length: m"),
         ({"joints": [f"j{i}_rad" for i in (2, 1, 3, 4, 5, 6)]},
          "check their order and the model, or leave out joints"),

@@ -405,7 +405,9 @@ def test_an_arm_moved_by_others_is_scanned_when_it_has_moved_on_and_stood(graph:
         assert ready_after(graph, arm) >= 1.0
         graph.joints = graph.joints + 0.002
         assert 0.5 < ready_after(graph, arm) < 0.56
-        with refused("ur5e on /joint_states: others move it; it cannot be servoed"):
+        with refused(
+            "ur5e on /joint_states: a person or another program moves the arm; it cannot be servoed"
+        ):
             arm.move_velocity(np.zeros(6), 0.5)
         arm.stop()
     assert graph.published == [] and graph.offered == []

@@ -165,8 +165,7 @@ def test_before_a_wrist_circle_stands_its_plate(height: float, flaw: float | Non
     plate = ring(0, 0.7 * WRIST.rim, height=height * WRIST.details.thickness)
     found = compared(circle, np.concatenate([circle, plate]), WRIST)
     said = None if flaw is None else (
-        f"a disc 90 mm across has no plate {thickness:.1f} mm before it, its middle stands "
-        f"{flaw * thickness:.1f} mm out"
+        f"a disc 90 mm across has no plate {thickness:.1f} mm in front of it; its middle is {flaw * thickness:.1f} mm out"
     )  # fmt: skip
     assert (found.flaw, found.rank) == (said, 4 if flaw is None else 2)
 

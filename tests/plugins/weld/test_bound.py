@@ -46,7 +46,7 @@ def test_the_files_are_known_to_so_many_sigma_within_the_error_that_is_allowed(
     beyond = (1.0 - NormalDist().cdf(sigmas)) / (1.0 + 0.12 / DISTANCE)
     bound = NormalDist().inv_cdf(1.0 - beyond) * np.sqrt(prior.fixed_variance(asked))
     check_bound(plan, prior, asked.model_copy(update={"max_error": 1.001 * bound}))
-    with pytest.raises(StageError, match=f"{bound * 1e3:.2f} mm at best at .* calibrate the tool"):
+    with pytest.raises(StageError, match=f"{bound * 1e3:.2f} mm at best, .* calibrate the tool"):
         check_bound(plan, prior, asked.model_copy(update={"max_error": 0.999 * bound}))
 
 

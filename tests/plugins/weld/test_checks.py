@@ -216,7 +216,7 @@ def test_a_seam_bends_out_of_its_surface_by_no_more_than_the_tip_stands(
     assert bool(found) == bool(says) and says in found
 
 
-@pytest.mark.parametrize(("angle", "says"), [(59.0, ""), (61.5, "the tool would stand at 6")])
+@pytest.mark.parametrize(("angle", "says"), [(59.0, ""), (61.5, "the tool would be at 6")])
 def test_a_tool_is_never_pushed_round_a_bend(angle: float, says: str) -> None:
     """At 60 deg to the seam it would be; on a circle by half the arc of its chord."""
     turn, radius = np.linspace(0.0, 3.0, 600), 0.023

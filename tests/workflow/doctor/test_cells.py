@@ -156,7 +156,7 @@ FAULTS = {
     ),
     "stands elsewhere": (
         in_recipe("second: base", "second: rail"),
-        "second stands on base, not on rail",
+        "second is mounted on base, not on rail",
     ),
     "a row elsewhere": (
         a_row_elsewhere(first),
@@ -247,7 +247,8 @@ def test_a_camera_on_another_link_is_named(link: int | None, tmp_path: Path) -> 
     in_recipe(r"\n +link: 3\n", f"\n      link: {link}\n" if link else "\n")(folder)
     (finding,) = examined(folder)
     assert (
-        finding.what == f"forearm stands on arm_link3, not on arm{f'_link{link}' if link else ''}"
+        finding.what
+        == f"forearm is mounted on arm_link3, not on arm{f'_link{link}' if link else ''}"
     )
     pasted(folder, finding)
     assert examined(folder) == ()

@@ -100,7 +100,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
     [
         (
             TWO.replace("marker: arm", "marker: amr"),
-            "r.yaml:2: cell.targets.marker.on: nothing can stand on 'amr': write base or arm",
+            "r.yaml:2: cell.targets.marker.on: nothing can be mounted on 'amr': write base or arm",
         ),
         (
             TWO.replace("right: base", "arm: base"),
@@ -112,7 +112,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         ),
         (
             TWO.replace("arm: ur5", "arm: ur5, other: ur5"),
-            "r.yaml:2: cell: 'other' and 'arm' both stand at the origin of base; write place: "
+            "r.yaml:2: cell: 'other' and 'arm' are both at the origin of base; write place: "
             "unknown for one of them, or its position",
         ),
         (

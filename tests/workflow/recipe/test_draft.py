@@ -643,10 +643,9 @@ def two_poses_of_nobody(folder):
          "rec/s.zip: is an archive; unpack it: unzip rec/s.zip -d rec/s; then flangeye init rec"),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],
          "rec/scan.e57: is an E57 scan, which is not read; save it as .ply"),
-        (deep, [], "rec: its files stand in folders of folders, as a/1/robot.csv; name the folder "
+        (deep, [], "rec: its files are in nested folders, such as a/1/robot.csv; name the folder "
          "of one session: flangeye init rec/a"),
-        (alone, [], "rec/board.csv: has what the camera saw, and nothing says where the arm was; "
-         "put its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"),
+        (alone, [], "rec/board.csv: has what the camera measured, but no poses of the arm; put its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"),
         (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; give each "
          "a column time to join them by it, or remove the surplus"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "

@@ -49,7 +49,7 @@ class Viewpoint:
         if applied:
             return f"points turned into the scanner's frame by {shown}"
         return (
-            f"{shown} is not applied; if the points stand in another frame than the scanner's, "
+            f"{shown} is not applied; if the points are given in another frame than the scanner's, "
             "write viewpoint: true"
         )
 

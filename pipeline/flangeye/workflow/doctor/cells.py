@@ -329,7 +329,7 @@ def _of_mountings(cell: Cell) -> Iterator[Suspicion]:
         stands = cell.frames[name].parent
         for other in ("base", *cell.movers):
             if other != stands:
-                what = f"{name} stands on {other}, not on {stands}"
+                what = f"{name} is mounted on {other}, not on {stands}"
                 yield Suspicion("mounting", what, {("cell", group, name): {"on": other}})
 
 
@@ -340,7 +340,7 @@ def _of_links(session: CellSession) -> Iterator[Suspicion]:
         stands = cell.frames[name].parent
         for link in _links_beside(stands, session.observations, cell):
             on = {"on": link.arm, "link": link.number}
-            what = f"{name} stands on {link.frame}, not on {stands}"
+            what = f"{name} is mounted on {link.frame}, not on {stands}"
             yield Suspicion("mounting", what, {("cell", group, name): on})
 
 

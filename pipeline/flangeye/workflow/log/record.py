@@ -277,6 +277,7 @@ class Recorder:
         now = time.time_ns()
         try:
             self._writer.add_message(self._channels[topic], now, data, now)
+            # Flushed each time: a viewer follows the file, and a killed run keeps its captures
             self._file.flush()
         except OSError as error:
             raise self._unwritable(error) from None
@@ -311,6 +312,7 @@ def _thinned(cloud: t.PointCloud, most: int = 40_000) -> NDArray[np.float32]:
     """Return at most a given number of finite points, evenly thinned."""
     flat = cloud.xyz.reshape(-1, 3)
     if cloud.organised:
+        # The same step along rows and columns keeps the scan's proportions
         step = max(1, int(np.ceil(np.sqrt(len(flat) / most))))
         flat = cloud.xyz[::step, ::step].reshape(-1, 3)
     else:

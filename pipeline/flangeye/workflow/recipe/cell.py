@@ -86,7 +86,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
             link = f"; a link is written {{on: {each.on.partition('_')[0]}, link: 3}}"
             yield (
                 (group, name, "on"),
-                f"nothing can stand on '{each.on}': write {' or '.join(carriers)}"
+                f"nothing can be mounted on '{each.on}': write {' or '.join(carriers)}"
                 f"{link if 'link' in each.on else ''}",
             )
     for group, name, each, _ in _on_links(section):
@@ -126,7 +126,7 @@ def _at_one_place(section: CellSection) -> Iterator[Mistake]:
         if each.on in seen:
             yield (
                 (),
-                f"'{name}' and '{seen[each.on]}' both stand at the origin of {each.on}; write "
+                f"'{name}' and '{seen[each.on]}' are both at the origin of {each.on}; write "
                 f"place: unknown for one of them, or its position",
             )
         seen[each.on] = name

@@ -64,6 +64,7 @@ class _Builder:
         kind = node.get("x-flangeye-part")
         if kind is None:
             return {key: self._with_parts(value) for key, value in node.items()}
+        # A default is a BoundPart, which JSON Schema cannot write
         kept = {k: v for k, v in node.items() if k not in ("x-flangeye-part", "default")}
         return {**kept, "allOf": [self._choice(kind)]}
 

@@ -115,6 +115,7 @@ def figure3d(traces: list[Trace], eye: tuple[float, float, float] = (1.7, 0.92, 
 
 
 def _as_columns(trace: Trace) -> Trace:
+    # The only place where traces change from metres to millimetres
     columns = {axis: packed(trace["xyz"][:, i] * 1e3) for i, axis in enumerate("xyz")}
     return {**{key: value for key, value in trace.items() if key != "xyz"}, **columns}
 
@@ -130,6 +131,7 @@ def thinned(rows: NDArray[Any], limit: int) -> NDArray[Any]:
 def round_up(value: float) -> float:
     """Return the next of 1, 2, 5, 10, … that is not below ``value`` > 0."""
     power = 10.0 ** np.floor(np.log10(value))
+    # The factor absorbs rounding, or 2.0000001 would become 5
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value * 0.999999))
 
 

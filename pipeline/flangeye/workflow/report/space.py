@@ -42,6 +42,7 @@ def workspace_drawing(facts: Facts) -> PlotlyFigure | None:
     # Points along each edge of the workspace box
     grid = t.Box(box.centre, box.size).grid(5)  # type: ignore[arg-type]
     covariances = covariance_at(np.array(estimate.covariance), np.array(estimate.about), grid)
+    # Root of the trace: the rms length of the error vector
     sigma = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
     traces = [
         _predicted(grid, sigma),
@@ -133,6 +134,7 @@ def _true_errors(facts: Facts, grid: Floats, extent: float) -> tuple[Trace, floa
     true = truth.transforms.get(name) or truth.base_T_camera
     error = np.array(estimate.matrix) @ np.linalg.inv(np.array(true))
     shift = mapped(error, grid) - grid
+    # Along unobservable directions the estimate is arbitrary, and its error says nothing
     free = np.reshape(estimate.unobservable or [], (-1, 6))[:, 3:]
     shift = shift - shift @ free.T @ free
     largest = float(np.linalg.norm(shift, axis=1).max())

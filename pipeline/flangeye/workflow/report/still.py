@@ -162,6 +162,7 @@ def _arm(scene: StillScene) -> list[_Polyline]:
     if scene.robot is None:
         return []
     joints = ready(scene.robot) if scene.joints is None else scene.joints
+    # Painter's algorithm: the nearest capsule is drawn last
     towards = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH), np.tan(ELEVATION)])
     placed = sorted(rods(scene.robot, joints), key=lambda rod: float((rod[1] @ towards).mean()))
     edge, fill = "var(--axis, #5b6474)", "var(--arm, #b9c1cd)"

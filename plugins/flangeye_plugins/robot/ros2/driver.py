@@ -259,7 +259,9 @@ class FreedriveArm(Listener):
 
     def move_velocity(self, twist: Floats, acceleration: float) -> None:
         """Raise DeviceError: others move the arm."""
-        raise DeviceError(f"{self.name}: others move it; it cannot be servoed")
+        raise DeviceError(
+            f"{self.name}: a person or another program moves the arm; it cannot be servoed"
+        )
 
     def stop(self) -> None:
         """Do nothing: others move the arm."""

@@ -175,8 +175,8 @@ def check_bound(plan: Path, prior: ModelPrior, settings: Following) -> None:
         return
     what, remedy = REMEDIES[found.largest(worst)]
     raise StageError(
-        f"weld.tactile: the torch is known to {bound * 1e3:.2f} mm at best at "
-        f"{found.s[worst] * 1e3:.0f} mm of the seam ({settings.sigmas:.3g} sigma over its "
+        f"weld.tactile: the torch is known to {bound * 1e3:.2f} mm at best, "
+        f"{found.s[worst] * 1e3:.0f} mm along the seam ({settings.sigmas:.3g} sigma over its "
         f"whole length, most of it {what}), max_error is {settings.max_error * 1e3:.3g} mm; "
         f"{remedy}, or raise 'max_error'"
     )

@@ -45,7 +45,7 @@ from flangeye.workflow.recipe.draft.headings import (
 )
 from flangeye.workflow.recipe.draft.survey import Questions, one_of
 
-TURN_FIRST = "the rotation stands before the position"
+TURN_FIRST = "the rotation comes before the position"
 NAME_THE_ARM = "name the arm: --robot NAME ('flangeye robots' lists them), or its .urdf"
 WAYS = {"": ("base_T_flange", "flange_T_base"), "target-": ("camera_T_target", "target_T_camera")}
 
@@ -112,6 +112,7 @@ def _row_names(table: Table, other: Table | None) -> Column | None:
     column = rests[0].index
     if rests[0].scan is not None or column is None or len({rest.index for rest in rests}) > 1:
         return rests[0].scan
+    # An index that rises by ones only counts the rows; with gaps it names them
     counted = ((np.diff(each.numbers([each.index(column)])[:, 0]) == 1).all() for each in tables)
     return None if all(counted) else column
 
@@ -151,8 +152,9 @@ def _require_as_many(tables: Sequence[Table], arm: PoseColumns) -> None:
 def _alone(arm: PoseColumns) -> str:
     if arm.role == "target":
         return (
-            f"{arm.table.file}: has what the camera saw, and nothing says where the arm was; put "
-            "its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"
+            f"{arm.table.file}: has what the camera measured, but no poses of the arm; put its "
+            f"poses "
+            "or joint angles beside it as .csv, a row each, or add --columns NAMES"
         )
     return (
         f"{arm.table.file}: has poses of the arm, but there are no scans beside it, and no columns "
@@ -207,7 +209,7 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
         questions.assumed.append(f"the arm's poses: {first.name}, not {rest} (--table changes it)")
     elif len(likely) > 1 and _in_order(likely):
         questions.assumed.append(
-            f"the arm's poses: {_place(first)}, which stand before {_place(likely[1])} "
+            f"the arm's poses: {_place(first)}, which come before {_place(likely[1])} "
             "(--table or --columns changes it)"
         )
     elif len(likely) > 1:

@@ -79,6 +79,7 @@ def _is_index(numbers: Floats) -> bool:
 def _of_whole_row(numbers: Floats) -> bool:
     """Return whether rows consist of poses alone, without an index or a time before them."""
     seven = numbers.shape[1] == 7 and _quaternion_at(numbers) is None
+    # Seven numbers of which one exceeds any angle: a time or an index, then six
     return _shape(numbers) and not (seven and np.abs(numbers).max() > 360.0)
 
 
@@ -97,6 +98,7 @@ def _parts(numbers: Floats) -> list[tuple[int, int]]:
         return []  # rotations, whose positions stand elsewhere
     if width == 3 or (width in (6, 7, 12, 16) and not (width == 12 and not _is_matrix(numbers))):
         return [(0, width)]
+    # Tools that write both poses in a row write the arm's first
     for first, second in (
         (16, 16), (12, 12), (7, 7), (6, 6), (6, 16), (7, 16), (6, 7), (7, 6), (16, 3), (7, 3),
         (6, 3),
@@ -313,6 +315,7 @@ def _by_places(alike: Iterable[tuple[Key, Floats, Floats]]) -> tuple[Key, str] |
 
 def _fits(apart: float) -> bool:
     """Return whether angles differ by so little as they do in the right convention."""
+    # Noise of arm and scan is tenths of a degree here, a wrong convention tens of degrees
     return apart <= math.radians(3.0)
 
 

@@ -127,10 +127,12 @@ class PoseColumns:
     @property
     def role(self) -> str | None:
         """``arm`` or ``target``, from the names of columns, program or file; None if unknown."""
+        # Only controllers write a maker's convention; cameras and ROS write plain ones
         if self.table.convention is not None and not self._is_echo:
             return "arm"
         if self.axes_of_motion:
             return "target"
+        # rvecs and tvecs are OpenCV's names for what a camera measures (solvePnP, calibrateCamera)
         opencv = "target" if self.called.lower().removesuffix("s") in _OPENCV else None
         of_columns = role_in(self.called)
         names = [self.table.name.rpartition(":")[2], *re.split(r"[/:]", self.table.name)[::-1]]
@@ -228,6 +230,7 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
         seen[listed] += bool(listed)
         joint = _JOINT_HEADING.fullmatch(name.lower().replace(" ", "_").rpartition(".")[2])
         joint = joint or _JOINT_HEADING.fullmatch(name.lower())
+        # A list called q: joint angles if it has five or more, a quaternion if it has four
         joint = joint or re.fullmatch(r"(.*[._])?q", listed.lower()) if size > 4 else joint
         order = "wxyz" if "wxyz" in listed.lower() else "xyzw"
         words = _of_list(listed, order[nth]) if size in (3, 4) else _words(listed if size else name)
@@ -251,6 +254,7 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
                 plain = [each for each in words if each.lower() not in ("xyzw", "wxyz")]
                 stated = len(plain) < len(words)
                 _put(groups, name, plain, listed=size == 4, ordered=stated or size != 4)
+    # No arm has fewer than four joints, so j1 to j3 alone count something else
     joints = rest.joints if len(rest.joints) > 3 else ()
     return groups, replace(rest, joints=joints_in_order(map(str, joints)) or joints)
 
@@ -338,6 +342,7 @@ def _put(
     if _is_axis(words[0]) and not _is_axis(words[-1]):  # ``x_robot``
         words = [*words[1:], words[0]]
     axis, before = words[-1].lower(), words[:-1]
+    # px is the x of a position, tx that of a translation
     if len(axis) == 2 and axis[0] in "pt" and axis[1] in "xyz":
         axis = axis[1]
     plain = axis in ("x", "y", "z", "w")
@@ -409,6 +414,7 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     if names is None:
         return PoseColumns(table, place, ("point",), *stated)
     known = (table.convention,) if table.convention else ROTATIONS[names]
+    # A list of four without letters: ROS and SciPy write w last, ABB and Eigen's constructor first
     if not group.ordered and names == ("qx", "qy", "qz", "qw"):
         known = ("quaternion_xyzw", "quaternion_wxyz")
     return PoseColumns(table, (*place, *(group.columns[n] for n in names)), known, *stated)
@@ -449,6 +455,7 @@ def frames_in(name: str) -> tuple[str, str] | None:
     first, second = (_FRAMES.get(word.lower()) for word in match.groups())
     if first is None or second is None:
         return None
+    # base2tool maps coordinates of the base to the tool's: it is tool_T_base (OpenCV's names)
     pair = (second, first) if to else (first, second)
     of_arms = {"base", "flange"}, {"world", "flange"}
     of_sights = {"camera", "target"}, {"camera", "world"}
@@ -472,5 +479,6 @@ def role_in(name: str) -> str | None:
     if frames is not None:
         return "target" if "camera" in frames else "arm"
     found = {"target": SEEN.search(name.lower()), "arm": _ARM_WORDS.search(name.lower())}
+    # A name such as robot_marker.csv has words of both sides and decides nothing
     roles = [role for role, match in found.items() if match]
     return roles[0] if len(roles) == 1 else None

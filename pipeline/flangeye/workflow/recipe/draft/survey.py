@@ -202,13 +202,14 @@ def _where_files_are(folder: Path) -> Path:
         RecipeError: There are files in several subfolders only; the message names one.
     """
     inner = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    # Archives often unpack into a folder within a folder
     while len(inner) == 1 and inner[0].is_dir():
         folder, inner = inner[0], list(inner[0].iterdir())
     if not any(p.is_file() for pattern in ("*", "*/*") for p in folder.glob(pattern)):
         deep = next((p for p in sorted(folder.glob("*/*/*")) if p.is_file()), None)
         if deep is not None:
             raise RecipeError(
-                f"{folder}: its files stand in folders of folders, as {deep.relative_to(folder)}; "
+                f"{folder}: its files are in nested folders, such as {deep.relative_to(folder)}; "
                 f"name the folder of one session: flangeye init {deep.parents[1]}"
             )
     return folder
@@ -277,6 +278,7 @@ def _by_whom(folder: Path, table: Table) -> list[Table]:
     """Return the rows of arm and target, if a column names the owner of each row."""
     for column in range(len(table.heading)):
         called = [str(name) for name in dict.fromkeys(table.texts(column))]
+        # Owners recur (robot, marker, robot, …), names of rows do not
         few = len(called) * MIN_CAPTURES <= len(table.rows)
         if few and {role_in(name) for name in called} >= {"arm", "target"}:
             return [read_table(folder, f"{table.name}:{name}") for name in called if role_in(name)]
@@ -300,6 +302,7 @@ def _whole(folder: Path, tables: Sequence[Table]) -> list[Table]:
     used: set[str] = set()
     for turns in tables:
         key = keys.get(turns.name)
+        # Each rotation looks for its position; the reverse would join every pair twice
         if key is None or key[0].startswith(("t", "p")):
             continue
         for places_of in tables:
