@@ -24,7 +24,7 @@ Later = Annotated[
 ]
 More = Annotated[
     list[Path] | None,
-    typer.Argument(metavar="[NEW]...", help="More archives, as with --archive."),
+    typer.Argument(metavar="[NEW]...", help="Later scans too, as with --archive."),
 ]
 Move = Annotated[
     bool,

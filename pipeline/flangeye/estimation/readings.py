@@ -128,7 +128,7 @@ def likely(
 
 
 def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> Reading:
-    """Return the changes that lead from the loop as read to one of the eight readings."""
+    """Return the changes to the poses as read that give one of the eight readings."""
     if exchanged:
         return Reading(True, inverse != in_hand, inverse != (in_hand != remounted), remounted)
     return Reading(False, inverse, inverse != remounted, remounted)

@@ -191,7 +191,7 @@ class OffsetWrist:
 
 
 def offset_wrist(directions: Floats, points: Floats, flange: Floats) -> OffsetWrist | None:
-    """Return the inverse kinematics of an arm, or of the nominal one it differs from a little.
+    """Return the solver of an arm; of the nominal arm if this one differs from it by little.
 
     Args:
         directions: (6, 3) of the axes, all joints at zero.

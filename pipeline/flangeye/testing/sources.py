@@ -226,7 +226,7 @@ class PlanConformance(Conformance):
             plan = self.call({}, site, np.random.default_rng(0))
             return None if not list(itertools.islice(plan.poses, 1)) else plan
 
-        require_refusal(planned, type(None), "a site that shows nothing")
+        require_refusal(planned, type(None), "a site where no pose shows the flange")
 
 
 def _facing(point: Floats, eye: Floats) -> Floats:

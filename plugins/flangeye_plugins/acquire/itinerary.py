@@ -101,7 +101,7 @@ class Itinerary:
             self._look_again()
 
     def _look_again(self) -> None:
-        """Replan with the scanner's estimated pose, which was a guess before."""
+        """Replan with the scanner's estimated pose in place of the guess."""
         base_T_camera = view_of([seen for seen in self.outcomes.values() if seen])
         if base_T_camera is not None:
             self._reach.look_from(base_T_camera)

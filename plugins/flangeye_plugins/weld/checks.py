@@ -166,7 +166,8 @@ def check_seam(seam: Seam, surface: WorkSurface, distance: float, settings: Foll
     if fault > settings.reach:
         raise StageError(
             f"weld.tactile: the plan's start is uncertain by {fault * 1e3:.1f} mm, the groove is "
-            f"sought within {settings.reach * 1e3:.1f} mm; plan it better, or raise 'reach'"
+            f"sought within {settings.reach * 1e3:.1f} mm; plan the start more accurately, or "
+            f"raise 'reach'"
         )
 
 

@@ -210,7 +210,7 @@ def test_a_cycle_is_waited_for_until_there_is_another_sample(robot: UrRobot, lin
     assert link.slept == [0.1 * 0.002]
     link.comes = False
     began = link.now
-    with pytest.raises(DeviceError, match="^ur5e sends nothing any more: its cycles have stopped$"):
+    with pytest.raises(DeviceError, match="^ur5e: the controller has stopped sending data$"):
         robot.wait_cycle()
     assert link.now - began == pytest.approx(0.1, abs=0.00045)
 

@@ -162,7 +162,7 @@ LOSSES = ("die", "drop", "freeze", "latency=400 ms")
 LOST = (
     "is lost: its",
     "its last sample is",
-    "sends nothing any more",
+    "has stopped sending data",
     "did not answer",
     "Timeout connecting to UR dashboard server",
 )

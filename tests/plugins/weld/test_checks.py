@@ -225,7 +225,9 @@ def test_a_tool_is_never_pushed_round_a_bend(angle: float, says: str) -> None:
     assert bool(found) == bool(says) and says in found
 
 
-@pytest.mark.parametrize(("share", "says"), [(1.0, ""), (1.02, "plan it better, or raise 'reach'")])
+@pytest.mark.parametrize(
+    ("share", "says"), [(1.0, ""), (1.02, "plan the start more accurately, or raise 'reach'")]
+)
 def test_a_plan_is_known_at_its_start_to_within_what_is_sought(share: float, says: str) -> None:
     one = float(tube_radii(seam_of(line(0.1), 1.0))[0])
     sigma = np.full(300, 100.0 * ASKED.reach / one)  # it may be less certain beyond its start

@@ -89,7 +89,7 @@ def test_a_recipe_alone_is_one_session(sessions: Callable[..., Any]) -> None:
         ({"grid": ("seed=1,2",), "repeat": 2},
          "--repeat counts the seed up, and --set-grid sets it; use one of them"),
         ({"repeat": 2, "vary": "steps.0.count"},
-         "--vary steps.0.count: only the seed can be repeated with; for other values write "
+         "--vary steps.0.count: --repeat can vary the seed only; for other values write "
          "--set-grid steps.0.count=a,b,c"),
         ({"grid": ("steps.2.inlier=0.2 mm,0.0002 m",)},
          "the same session is requested twice: toy.yaml steps.2.inlier=0.2 mm and "

@@ -134,7 +134,7 @@ def test_an_arm_of_four_joints_turns_about_one_axis() -> None:
         ),
         (
             TWO.replace("right: base", "right: arm_link3"),
-            "r.yaml:2: cell.cameras.right.on: nothing can stand on 'arm_link3': write base or "
+            "r.yaml:2: cell.cameras.right.on: nothing can be mounted on 'arm_link3': write base or "
             "arm; a link is written {on: arm, link: 3}",
         ),
         (

@@ -376,7 +376,7 @@ def _axis(text: str) -> tuple[str, list[str]]:
 def _check_repetition(request: Request, taken: bool) -> None:
     if request.vary != "seed":
         raise BatchError(
-            f"--vary {request.vary}: only the seed can be repeated with; for other values write "
+            f"--vary {request.vary}: --repeat can vary the seed only; for other values write "
             f"--set-grid {request.vary}=a,b,c"
         )
     if taken:

@@ -210,7 +210,7 @@ class FromEarlierRun(FromNothing):
 
     @property
     def first(self) -> int:
-        """Number of captures to take again; they come first, or a solver might have enough."""
+        """Number of captures to take again; they come first, before a solver has enough."""
         return len(self.retaken)
 
     def stream(self, acquire: Acquire) -> t.Captures | t.Observations:

@@ -298,7 +298,7 @@ class UrRobot(Device):
         late = False
         while (sample := self._link.sample()) is None or sample.number <= self._seen:
             if late:
-                raise DeviceError(f"{self.name} sends nothing any more: its cycles have stopped")
+                raise DeviceError(f"{self.name}: the controller has stopped sending data")
             time.sleep(0.1 * self.period)
             late = time.monotonic() > until
         self._seen = sample.number

@@ -48,7 +48,9 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
     name = questions.ask("scanner", "which scanner ('flangeye scanners')", None, "realsense-d435")
     scanner = load_model("scanners", name)
     if not isinstance(scanner, ScannerModel):
-        raise RecipeError(f"--scanner {name}: its file lacks what planning needs: what it sees")
+        raise RecipeError(
+            f"--scanner {name}: its file lacks the field of view and range that planning needs"
+        )
     target: dict[str, Any] = {"flange": {}}
     stands: dict[str, Any] = {}
     if cell.pixels is not None:

@@ -555,7 +555,7 @@ def _rotation(pose: PoseColumns, questions: Questions, prefix: str, maker: str |
         # without names
         likely = ("kuka", "quaternion_xyzw", "xyzw")
         usual = pose.rotations[0] if pose.rotations[0] in likely else None
-    if not prefix and usual and key not in questions.likely:
+    if not prefix and usual and usual == usual_of(maker) and key not in questions.likely:
         usual = _usual_in_its_unit(pose, usual, questions)
     shown = ", ".join(map(str, pose.columns[3:] or pose.columns))
     joints = ", or joints, with --robot" if pose.may_be_joints and not prefix else ""

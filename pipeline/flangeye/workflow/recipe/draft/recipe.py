@@ -396,7 +396,12 @@ def _body(mesh: str, out: Path, configuration: dict[str, Any]) -> dict[str, Any]
 
 
 def _length_of_files(questions: Questions) -> str:
-    return questions.ask("length", "unit of pos01.yaml and so on", "mm", check=one_of("m", "mm"))
+    return questions.ask(
+        "length",
+        "unit of the positions in pos01.yaml, pos02.yaml, …",
+        "mm",
+        check=one_of("m", "mm"),
+    )
 
 
 def _camera(archive: Archive, target: Mapping[str, Any], questions: Questions) -> dict[str, Any]:
