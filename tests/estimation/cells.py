@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from flangeye.estimation.graph import Problem
+from flangeye.estimation.sightings import problem_of
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.cell import Frame, cell_of
@@ -173,6 +175,17 @@ def _feature(true, noise, kind, rng):
     normal = turned[:, 2] if kind == "normal" else None
     of_normal = None if normal is None else -turn * hat(normal) @ hat(normal)
     return CircleFeature(centre, normal, {"rim": 0.0315}, shift * np.eye(3), of_normal, 1.0)
+
+
+EXACT = Noise(1e-7, 1e-8, 0.0, 0.0)
+"""Of features alone: a millionth of what real ones have."""
+
+
+def problem_in(name: str, feature: str, n: int = 15, seed: int = 1) -> Problem:
+    """Return the problem of a session of a configuration whose sightings are exact."""
+    configuration = CONFIGURATIONS[name]
+    made = session(configuration, np.random.default_rng(seed), n, 0.6, EXACT, feature)
+    return problem_of(made.observations, cell_of(configuration, ROBOT, ROBOT), True)
 
 
 def errors(found, truth):

@@ -133,6 +133,15 @@ def test_all_matrices_have_the_quadratics_values_for_rotations_alone(three: bool
         assert abs(at @ (matrix - dual.bare) @ at) > 0.1  # it is not a product of two places
 
 
+@pytest.mark.parametrize("three", [False, True])
+def test_what_is_bounded_is_of_rotations_alone_and_has_their_length(three: bool) -> None:
+    squares, dual = duals_of(three)
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        at = squares.features(np.array([anywhere(rng) for _ in range(3 if three else 2)]))
+        assert at**2 @ dual.bounded == pytest.approx(1.0)
+
+
 def test_of_one_rotation_twenty_are_independent_and_of_two_in_products_as_many_as_they_can() -> (
     None
 ):

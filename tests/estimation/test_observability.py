@@ -13,8 +13,10 @@ from flangeye.estimation.observability import (
     _median_distance,
     _stands_still,
     _turns,
+    fewest_sightings,
     in_base,
     information_of_centres,
+    require_enough,
     require_observable,
     require_poses,
     require_right_handed,
@@ -23,10 +25,12 @@ from flangeye.estimation.observability import (
     robust_sigma,
     spread_of,
     suggest,
+    symmetry_moves,
     weak_moves,
 )
 from flangeye.types import Floats
 from flangeye.types.geometry import kabsch, rigid, rotation_exp
+from tests.estimation.cells import problem_in
 
 
 def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
@@ -254,3 +258,30 @@ def test_a_motion_is_named_that_makes_what_is_weak_known_twice_as_well() -> None
         chosen, left = suggest(known, np.ones(2), {"it": better})
         assert chosen == (["it"] if named else [])
         assert left.excess[0] == pytest.approx(after if named else excess)
+
+
+@pytest.mark.parametrize(
+    ("name", "fewest"),
+    [
+        ("eye-on-base, flange", (3, 3, 3)),
+        ("eye-on-base, marker", (3, 4, 6)),
+        ("two arms, flange", (3, 5, 8)),
+        ("two arms, marker", (6, 4, 6)),
+    ],
+)
+def test_fewer_sightings_do_than_unknowns_for_what_tells_more(
+    name: str, fewest: tuple[int, int, int]
+) -> None:
+    for feature, count in zip(("pose", "normal", "centre"), fewest, strict=True):
+        problem = problem_in(name, feature, 8)
+        assert fewest_sightings(problem) == count
+        require_enough(problem, 8)
+        with pytest.raises(StageError, match="9 poses needed for .* leaves unknown, 8 given"):
+            require_enough(problem, 9)
+
+
+def test_a_round_target_may_be_turned_about_its_axis_and_a_centre_about_all() -> None:
+    for feature, turns in (("pose", []), ("normal", [8]), ("centre", [6, 7, 8])):
+        found = symmetry_moves(problem_in("eye-on-base, marker", feature, 8))
+        np.testing.assert_array_equal(found, np.eye(12)[:, turns])
+        assert symmetry_moves(problem_in("eye-on-base, flange", feature, 8)).shape == (6, 0)

@@ -40,7 +40,7 @@ class OperatorConsole:
         self._said.write(text + "\n")
         self._said.flush()
 
-    def line(self, patience: float = 0.0) -> str | None:
+    def line(self, patience: float) -> str | None:
         """Return the next typed line, skipping blank ones; None if there is none yet.
 
         Args:
@@ -142,7 +142,7 @@ class ManualRobot(Device):
 
     def state(self) -> RobotState:
         """Return the arm's state with the pose entered last."""
-        self._listen()
+        self._listen(patience=0.0)
         return RobotState(
             base_T_flange=Transform(BASE, FLANGE, self._pose),
             joints=self._joints,
@@ -192,7 +192,7 @@ class ManualRobot(Device):
         self._desk.say(f"Go to   {self._convention.text(base_T_flange)}")
         self._desk.say("then type or paste where it stands")
 
-    def _listen(self, patience: float = 0.0) -> None:
+    def _listen(self, patience: float) -> None:
         """Process typed lines while a pose is being requested.
 
         Raises:

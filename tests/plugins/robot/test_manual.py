@@ -99,6 +99,35 @@ def test_joint_angles_are_asked_for_as_the_pose_they_make_and_stay_on_their_bran
     np.testing.assert_allclose(robot.state().joints, target, atol=2e-4)
 
 
+def test_of_a_joint_s_turns_the_one_nearest_to_where_it_stood_is_taken(person: Person) -> None:
+    stood, target = HOME.copy(), HOME.copy()
+    stood[5], target[5] = 4.0, 5.78  # which is also -0.5
+    person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
+    robot = person.robot()
+    robot.move_joints(stood, 0.1, 0.5)
+    person.types(CONVENTIONS["ur"].text(ARM.flange(stood)))
+    np.testing.assert_allclose(robot.state().joints, stood, atol=2e-4)
+    there = ARM.flange(target)
+    robot.move_linear(Transform("base", "flange", there), 0.1, 0.5)
+    person.types(CONVENTIONS["ur"].text(there))
+    np.testing.assert_allclose(robot.state().joints, target, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "taken"),
+    [(0.0198, 0.0, True), (0.0202, 0.0, False), (0.0, 4.9, True), (0.0, 5.1, False)],
+)
+def test_a_pose_within_two_centimetres_and_five_degrees_is_taken(
+    person: Person, metres: float, degrees: float, taken: bool
+) -> None:
+    person.types(CONVENTIONS["kuka"].text(AT_HOME.matrix))
+    robot = person.robot("kuka")
+    robot.move_linear(AT_HOME, 0.1, 0.5)
+    near = moved(AT_HOME, z=-metres, turn=(0.0, 0.0, np.radians(degrees)))
+    person.types(CONVENTIONS["kuka"].text(near.matrix))
+    assert robot.state().mode == ("ready" if taken else "moving")
+
+
 def test_a_strange_pose_is_asked_about_and_kept_when_it_is_meant(person: Person) -> None:
     person.types(CONVENTIONS["kuka"].text(AT_HOME.matrix))
     robot = person.robot("kuka")
@@ -241,6 +270,32 @@ def test_beside_the_pose_there_is_no_tool() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("beside", "beyond", "turned", "said"),
+    [
+        (0.0198, 0.15, 0.0, "is this the pose of a tool, 150 mm beyond the flange?"),
+        (0.0202, 0.15, 0.0, ""),
+        (0.0, -0.15, 0.0, ""),
+        (0.0, 0.15, 4.9, "is this the pose of a tool, 150 mm beyond the flange?"),
+        (0.0, 0.15, 5.1, ""),
+    ],
+)
+def test_a_tool_is_long_along_the_flange_s_axis_and_not_turned(
+    beside: float, beyond: float, turned: float, said: str
+) -> None:
+    place = np.array([-0.6 * beside, 0.8 * beside, beyond])
+    tip = TILTED @ rigid(rotation_exp(np.radians([turned, 0.0, 0.0])), place)
+    words = CONVENTIONS["quaternion_xyzw"]
+    assert doubted(words.numbers(tip), "quaternion_xyzw").partition(": ")[2] == said
+
+
+@pytest.mark.parametrize("convention", ["ur", "abb"])
+def test_angles_in_the_opposite_order_are_named(convention: str) -> None:
+    numbers = CONVENTIONS[convention].numbers(TILTED)
+    typed = [*numbers[:3], *reversed(numbers[3:])]
+    assert doubted(typed, convention).endswith(": are the angles in the opposite order?")
+
+
 def test_a_pose_without_an_explanation_is_only_described() -> None:
     elsewhere = rigid(TILTED[:3, :3], TILTED[:3, 3] + [0.1, 0.0, 0.0])
     assert doubted(CONVENTIONS["kuka"].numbers(elsewhere), "kuka") == (
@@ -251,8 +306,8 @@ def test_a_pose_without_an_explanation_is_only_described() -> None:
 @pytest.mark.parametrize(
     ("metres", "said"),
     [
-        (0.0019, "that is 1.9 mm from the middle of the base"),
-        (0.0021, None),
+        (0.001995, "that is 2.0 mm from the middle of the base"),
+        (0.002005, None),
         (0.439, None),
         (0.441, "that is 0.441 m from the base, and the arm is 0.40 m long"),
     ],

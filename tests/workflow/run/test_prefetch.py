@@ -102,6 +102,9 @@ def test_threads_are_those_that_openmp_is_told(monkeypatch: pytest.MonkeyPatch) 
     for count, threads in ((5, 5), (None, 1)):
         monkeypatch.setattr(os, "cpu_count", lambda count=count: count)
         assert cores() == threads
+        monkeypatch.setenv("OMP_NUM_THREADS", "2")
+        assert cores() == min(threads, 2)
+        monkeypatch.delenv("OMP_NUM_THREADS")
 
 
 def test_a_run_on_one_core_and_on_many_is_the_same(

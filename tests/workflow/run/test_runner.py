@@ -174,6 +174,28 @@ def test_views_that_an_acquire_step_adds_reach_the_verification(
     assert result.verifications["4.verify.toy"].figures["views"] == 1
 
 
+@pytest.mark.parametrize(
+    ("own", "centre"),
+    [
+        ("", [0.0, 0.0, 0.0]),
+        ("workspace: {centre: [1 m, 2 m, 3 m], size: [1 m, 1 m, 1 m]}\n", [1, 2, 3]),
+    ],
+)
+def test_a_recipes_own_workspace_goes_before_that_of_its_source(
+    execute: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, own: str, centre: list[float]
+) -> None:
+    monkeypatch.setitem(toy.verify.needs, "box", t.Box)
+    told = list[t.Box]()
+
+    def verify(box, **_):
+        told.append(box)
+        return t.Verification(True, "as it is", {})
+
+    with replaced(toy.verify, verify):
+        execute(own + TOY_RECIPE)
+    assert [box.centre.tolist() for box in told] == [centre]
+
+
 def test_a_refused_calibration_keeps_its_evidence(execute: Callable[..., Any]) -> None:
     result, log = execute(TOY_RECIPE.replace("2 mm", "0.001 mm"))
     assert result.status == "refused"

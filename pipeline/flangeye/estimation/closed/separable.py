@@ -58,8 +58,7 @@ def horaud_dornaika(motions: Motions) -> Floats:
 
     The unit quaternion q that minimises the sum of ``|a q - q b|^2``, an eigenvector.
     """
-    a, b = 0.5 * _half_sines(motions.alpha), 0.5 * _half_sines(motions.beta)
-    rows = _commutators(a, b)
+    rows = _commutators(_half_sines(motions.alpha), _half_sines(motions.beta))
     values = np.linalg.eigh(np.einsum("nij,nik->jk", rows, rows))
     rotation = rotation_from_quaternion(values[1][:, 0])
     return rigid(rotation, translation_of(rotation, motions))

@@ -50,8 +50,9 @@ def cores() -> int:
     """Return the number of worker threads: the process's cores, or OMP_NUM_THREADS."""
     told = os.environ.get("OMP_NUM_THREADS", "")
     # In a batch job or container the process may use fewer cores than the machine has
-    mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return min(mine or 1, int(told)) if told.isdigit() and int(told) else mine or 1
+    own = hasattr(os, "sched_getaffinity")
+    mine = len(os.sched_getaffinity(0)) if own else os.cpu_count() or 1
+    return min(mine, int(told) or mine) if told.isdigit() else mine
 
 
 def prefetched(

@@ -223,15 +223,15 @@ class Runner:
         pairs = list(zip(self._held, found, strict=True))
         self._held = [poses for poses, one in pairs if one is None and not last]
         for poses, one in pairs:
+            capture = poses[0].id
             if one is not None:
-                self._finished(self._steps("fit")[0], one.id, one.feature)
+                self._finished(self._steps("fit")[0], capture, one.feature)
             elif last:
                 why, segment = ambiguous(poses), self._steps("segment")[0].stage.name
-                aside = t.Rejection(poses[0].id, segment, why.reason, why.figures, why.fix)
-                self._reject(aside)
+                self._reject(t.Rejection(capture, segment, why.reason, why.figures, why.fix))
             if one is not None or last:
-                stream.outcomes[poses[0].id] = one
-                self._hooks.flangeye_capture_finished(capture=poses[0].id)
+                stream.outcomes[capture] = one
+                self._hooks.flangeye_capture_finished(capture=capture)
         yield from (one for one in found if one is not None)
 
     def _require_seen(self) -> None:

@@ -1,0 +1,128 @@
+"""Where commands are sent, and which sighting tells most: what is predicted at poses not yet seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flangeye.estimation.graph import Places, Problem
+from flangeye.estimation.plan import most_informative
+from flangeye.estimation.work import Work, work_of
+from flangeye.types import Box, Floats
+from flangeye.types.geometry import invert
+from tests.estimation import foreign
+from tests.estimation.sessions import problem_of, robot
+
+SPREAD = np.diag([4e-6, 1e-6, 9e-6, 1e-8, 4e-8, 9e-8])
+"""Noise of a sighting in the target's axes."""
+COUNT = 16
+
+
+def session(kind: str = "marker") -> tuple[Problem, Places]:
+    """Return a session's problem, its noise fixed to the targets, and the true places."""
+    made = foreign.session(kind, foreign.UR5E, 1e-3, COUNT, 1)
+    problem = problem_of(made, kind, made.reported, made.joints, made.seen)
+    both = np.kron(np.eye(2), problem.seen.rotations)
+    seen = replace(problem.seen, covariances=both @ SPREAD @ np.swapaxes(both, 1, 2))
+    return replace(problem, seen=seen), {"camera": made.camera, "target": made.target}
+
+
+def flanges(problem: Problem) -> Floats:
+    return np.asarray(problem.frames["flange"].place)[problem.seen.times]
+
+
+def require_predicted(work: Problem, places: Places) -> None:
+    """Fail where sightings or their noise are not those that the places give."""
+    target = places["target"] if work.frames["target"].place is None else np.eye(4)
+    expected = invert(places["camera"]) @ flanges(work) @ target
+    np.testing.assert_allclose(work.seen.poses, expected, atol=1e-12)
+    turns = np.kron(np.eye(2), work.seen.rotations)
+    own = np.swapaxes(turns, 1, 2) @ work.seen.covariances @ turns
+    known = SPREAD if work.frames["target"].place is None else SPREAD * np.diag([1, 1, 0, 1, 1, 1])
+    np.testing.assert_allclose(own, np.tile(known, (len(work.seen), 1, 1)), atol=1e-18)
+
+
+@pytest.mark.parametrize("kind", ["marker", "flange"])
+def test_the_work_is_where_the_session_was_and_up_to_a_few_spacings_beyond(kind: str) -> None:
+    problem, places = session(kind)
+    work = work_of(problem, places)
+    np.testing.assert_array_equal(flanges(work.poses), flanges(problem))
+    for each in (work.poses, work.around):
+        require_predicted(each, places)
+    at, around = flanges(problem)[:, :3, 3], flanges(work.around)[:, :3, 3]
+    low, high = at.min(axis=0), at.max(axis=0)
+    spacing = (high - low) / (COUNT - 1)
+    assert (around >= low - 2.5 * spacing - 1e-12).all()
+    assert (around <= high + 2.5 * spacing + 1e-12).all()
+    assert (around.min(axis=0) < low - 2.2 * spacing).all()
+    assert (around.max(axis=0) > high + 2.2 * spacing).all()
+    assert len(around) > 200 and work.boxes.shape == (8, len(around))
+    within = ((around >= low) & (around <= high)).all(axis=1)
+    assert work.boxes[:, within].all()
+    # On average a box reaches one spacing beyond the outermost poses, less what is cut off
+    beyond = [around[inside].max(axis=0) - high for inside in work.boxes]
+    assert 0.4 < np.mean(beyond / spacing) < 1.1
+    assert len({int(inside.sum()) for inside in work.boxes}) > 4
+
+
+def test_a_box_that_is_stated_is_filled_evenly_with_the_session_s_orientations() -> None:
+    problem, places = session()
+    middle = flanges(problem)[:, :3, 3].mean(axis=0)
+    box = Box(middle, np.array([0.1, 0.06, 0.08]))
+    work = work_of(problem, places, box)
+    assert work.poses is work.around and work.boxes.all()
+    require_predicted(work.poses, places)
+    poses = flanges(work.poses)
+    assert len(poses) == 256 and work.boxes.shape == (1, 256)
+    off = (poses[:, :3, 3] - middle) / box.size
+    np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.01)
+    np.testing.assert_allclose(off.std(axis=0), 1 / np.sqrt(12), rtol=0.02)
+    assert np.abs(off).max() <= 0.5
+    turns = flanges(problem)[:, :3, :3]
+    which = np.abs(poses[:, None, :3, :3] - turns).max(axis=(2, 3))
+    assert which.min(axis=1).max() == 0.0
+    assert np.bincount(which.argmin(axis=1), minlength=COUNT).tolist() == [16] * COUNT
+    (carrier,) = work.poses.carriers
+    assert carrier.joints is not None and carrier.rates is None
+    np.testing.assert_allclose(robot("ur5e")[1].flange(carrier.joints), poses, atol=1e-6)
+
+
+def all_of_session(work: Work, problem: Problem) -> bool:
+    same = np.array_equal(flanges(work.poses), flanges(problem))
+    return same and work.poses is work.around and work.boxes.shape == (1, COUNT)
+
+
+def test_where_no_new_pose_can_be_worked_out_the_work_is_the_session() -> None:
+    problem, places = session()
+    far = Box(np.array([9.0, 0.0, 0.0]), np.full(3, 0.1))
+    assert all_of_session(work_of(problem, places, far), problem)
+    carrier = problem.carriers[0]
+    for carriers in ([], [replace(carrier, joints=None)], [replace(carrier, kinematics=None)],
+                     [replace(carrier, link=3)], [carrier, carrier]):  # fmt: skip
+        work = work_of(replace(problem, carriers=carriers), places, far)
+        assert all_of_session(work, problem)
+        require_predicted(work.poses, places)
+
+
+def test_the_sighting_that_is_chosen_leaves_least_and_then_counts() -> None:
+    rng = np.random.default_rng(0)
+    rows, levers = rng.standard_normal((7, 6, 9)), rng.standard_normal((4, 9))
+    root = rng.standard_normal((9, 9))
+    covariance = root @ root.T
+
+    def after(chosen: list[int]) -> Floats:
+        told = np.einsum("mai,maj->ij", rows[chosen], rows[chosen])
+        return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + told))
+
+    expected: list[int] = []
+    for count in range(1, 8):
+        left = [k for k in range(7) if k not in expected]
+        expected.append(
+            min(left, key=lambda k: np.trace(levers @ after([*expected, k]) @ levers.T))
+        )
+        chosen, then = most_informative(rows, covariance, levers, count)
+        assert chosen.tolist() == expected
+        np.testing.assert_allclose(then, after(expected), atol=1e-9)
+    assert most_informative(rows, covariance, levers, 20)[0].tolist() == expected
