@@ -133,11 +133,11 @@ def test_of_an_arm_whose_joints_are_unknown_the_base_and_the_flange_are_off() ->
 
 
 def test_the_noise_from_pose_to_pose_is_backlash_or_what_the_joints_would_tell() -> None:
-    (backlash,) = arm_scatters(problem_of())
-    assert (backlash.size, backlash.factor, backlash.cause) == (pytest.approx(2e-5), 4.0, "")
-    turn, shift = arm_scatters(problem_of(told=False))
-    assert (turn.size, turn.factor, turn.cause) == (pytest.approx(0.12e-3), 1.8, "arm")
-    assert (shift.size, shift.factor, shift.cause) == (pytest.approx(0.03e-3), 1.8, "arm")
+    def told(problem: Problem) -> list[Any]:
+        return [(pytest.approx(s.size), s.factor, s.cause) for s in arm_scatters(problem)]
+
+    assert told(problem_of()) == [(2e-5, 4.0, "")]
+    assert told(problem_of(told=False)) == [(0.12e-3, 1.8, "arm"), (0.03e-3, 1.8, "arm")]
 
 
 @pytest.mark.parametrize(("rank", "told"), [(6, []), (5, ["tilt", "offset"]), (3, ["offset"])])
@@ -206,6 +206,7 @@ def test_errors_of_joints_move_what_is_seen_as_turned_joints_do(
 def test_errors_of_links_move_what_is_seen_as_another_arm_does() -> None:
     problem = problem_of()
     joints = problem.carriers[0].joints
+    assert joints is not None
     lengths, twists = block(problem, "link lengths"), block(problem, "link twists")
     assert (lengths.shape, twists.shape) == ((12, 6, 12), (12, 6, 6))
     for i, which in np.ndindex(6, 3):

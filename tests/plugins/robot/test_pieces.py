@@ -104,3 +104,15 @@ def test_it_heads_straight_for_the_goal(monkeypatch: pytest.MonkeyPatch) -> None
     (velocity,) = gone
     np.testing.assert_allclose(velocity / np.linalg.norm(velocity), [0.6, -0.8])
     assert 0.09 < np.linalg.norm(velocity) <= 0.11
+
+
+@pytest.mark.parametrize(("acceleration", "speed"), [(4.0, 1.0), (0.25, 0.25), (100.0, 3.0)])
+def test_it_slows_down_by_half_of_the_acceleration_that_it_may_have(
+    monkeypatch: pytest.MonkeyPatch, acceleration: float, speed: float
+) -> None:
+    gone: list[Any] = []
+    ride = VelocityMove(3.0, acceleration, gone.append, lambda: None, lambda: None)
+    later = time.monotonic() + 10.0
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    ride.renew(np.array([0.25]), 0.25, 0.0)
+    assert gone == [pytest.approx([speed])]

@@ -171,12 +171,12 @@ class VelocityMove:
         if left < 2e-3:
             self._finish()
         else:
-            # Of the deceleration allowed, the share that is planned with: a velocity is followed a
-            # little late, and what it lags behind is made up for with the rest.
+            # v^2 = 2 (a / 2) s: half of the deceleration allowed is planned with. A velocity is
+            # followed a little late, and what it lags behind is made up for with the rest.
             self._velocity = min(
                 self._speed,
                 self._velocity + self._acceleration * passed,
-                float(np.sqrt(2.0 * 0.5 * self._acceleration * left)),
+                float(np.sqrt(self._acceleration * left)),
             )
             self._go(self._velocity / left * rest)
 
