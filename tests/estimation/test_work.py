@@ -25,7 +25,8 @@ def session(kind: str = "marker") -> tuple[Problem, Places]:
     made = foreign.session(kind, foreign.UR5E, 1e-3, COUNT, 1)
     problem = problem_of(made, kind, made.reported, made.joints, made.seen)
     both = np.kron(np.eye(2), problem.seen.rotations)
-    seen = replace(problem.seen, covariances=both @ SPREAD @ np.swapaxes(both, 1, 2))
+    covariances: Floats = np.asarray(both @ SPREAD @ np.swapaxes(both, 1, 2), dtype=np.float64)
+    seen = replace(problem.seen, covariances=covariances)
     return replace(problem, seen=seen), {"camera": made.camera, "target": made.target}
 
 
