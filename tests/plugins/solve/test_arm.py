@@ -106,6 +106,12 @@ def test_a_tool_offset_is_found_when_the_flange_turns(ur5: RobotModel) -> None:
     assert max(np.linalg.norm(p.residual) for p in calibration.pairs) < 0.3 * MM
 
 
+def test_where_there_is_no_tool_none_is_found(ur5: RobotModel) -> None:
+    calibration = solver(ur5)(simulate(ur5, 30))
+    assert calibration.correction is None
+    assert not any("the seen circle is" in note for note in calibration.notes)
+
+
 def test_a_tool_offset_is_found_beside_joint_zeros(ur5: RobotModel) -> None:
     offset = np.array([2.0, -1.5, 0.0]) * MM
     zeros = ur5.joint_accuracy * np.random.default_rng(5).standard_normal(6)

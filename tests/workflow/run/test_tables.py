@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -142,6 +143,17 @@ def test_a_table_of_the_arm_one_of_what_was_seen_and_a_recipe(tmp_path: Path, cl
         assert not (tmp_path / "clouds").exists()
         assert steps[1:] == ["solve.robust"]
     assert next(iter(steps[0])) == ("acquire.archive" if clouds else "acquire.centres")
+
+
+@pytest.mark.usefixtures("of_a_cell")
+def test_an_arms_joints_stand_behind_its_pose_and_are_named_in_the_recipe(tmp_path: Path) -> None:
+    seen = [replace(circle(k, [1e-8] * 3), arm_joints={"flange": np.arange(3.0)}) for k in (1, 2)]
+    arm, _, recipe = write_tables(log_of(TEXT, seen), tmp_path, UNUSED)
+    head, *rows = csv.reader(arm.read_text("utf-8").splitlines())
+    assert head[8:] == ["j1_rad", "j2_rad", "j3_rad"]
+    assert [row[8:] for row in rows] == [["0", "1", "2"]] * 2
+    (told,) = yaml.safe_load(recipe.read_text("utf-8"))["steps"][0].values()
+    assert told["reader"]["cell"]["arms"]["flange"]["joints"] == head[8:]
 
 
 @pytest.mark.usefixtures("of_a_cell")
