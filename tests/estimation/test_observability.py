@@ -29,7 +29,7 @@ from flangeye.estimation.observability import (
     weak_moves,
 )
 from flangeye.types import Floats
-from flangeye.types.geometry import kabsch, rigid, rotation_exp
+from flangeye.types.geometry import kabsch, levers, rigid, rotation_exp
 from tests.estimation.cells import problem_in
 
 
@@ -198,6 +198,17 @@ def test_a_rotation_that_stays_unknown_is_named_with_what_would_show_it() -> Non
         assert told in str(weak.value) and f"{noise * 1e3:.1f} mm of noise per axis; {cure}" in str(
             weak.value
         )
+
+
+def test_what_a_shift_would_explain_tells_nothing_of_a_rotation() -> None:
+    """Turns about a point far away shift the centres as well: neither is known by it better."""
+    flat = 0.1 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    limit = 4e-3 / np.sqrt(2 * 0.1**2)
+    rows = levers(flat + [3.0, -2.0, 1.0])
+    information = np.einsum("nai,naj->ij", rows, rows) / 4e-3**2
+    require_observable(flat, np.zeros((0, 3)), information, 4e-3, 1.01 * limit)
+    with pytest.raises(CalibrationRefused, match="is known to"):
+        require_observable(flat, np.zeros((0, 3)), information, 4e-3, 0.99 * limit)
 
 
 def test_of_two_rotations_that_are_weak_the_weaker_is_named() -> None:

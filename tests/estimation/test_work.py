@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.plan import most_informative
+from flangeye.estimation.plan import most_informative, work_of_frames
 from flangeye.estimation.work import Work, work_of
 from flangeye.types import Box, Floats
-from flangeye.types.geometry import invert
+from flangeye.types.geometry import invert, rigid, rotation_exp
 from tests.estimation import foreign
 from tests.estimation.sessions import problem_of, robot
 
@@ -127,3 +130,19 @@ def test_the_sighting_that_is_chosen_leaves_least_and_then_counts() -> None:
         assert chosen.tolist() == expected
         np.testing.assert_allclose(then, after(expected), atol=1e-9)
     assert most_informative(rows, covariance, levers, 20)[0].tolist() == expected
+
+
+def test_a_camera_has_to_be_right_where_it_saw_targets_and_else_a_frame_about_its_origin() -> None:
+    place = rigid(rotation_exp(np.array([0.3, -0.5, 0.8])), np.array([0.4, -0.7, 0.2]))
+    found: Any = SimpleNamespace(places={"camera": place, "target": place})
+    centres = np.array([[0.1, 0.2, 0.7], [-0.1, 0.0, 0.6]])
+    seen: Any = [
+        SimpleNamespace(camera="camera", feature=SimpleNamespace(centre=c)) for c in centres
+    ]
+    cell: Any = None
+    work = work_of_frames(found, cell, seen)
+    corners = 0.1 * np.array(list(product((-1.0, 1.0), repeat=3)))
+    for name, points in (("camera", centres), ("target", corners)):
+        expected = points @ place[:3, :3].T + place[:3, 3]
+        told = work[name][np.lexsort(work[name].T)]
+        np.testing.assert_allclose(told, expected[np.lexsort(expected.T)], atol=1e-12)
