@@ -238,7 +238,8 @@ class Trial:
         again = self._start(command, out, stderr=subprocess.PIPE)
         _, told = again.communicate()
         if again.returncode not in (0, 1):
-            yield f"{' '.join(command)}: {told.decode().strip()}"
+            ended = f"{' '.join(command)} ended with {again.returncode}"
+            yield f"{ended}: {told.decode().strip()}"
         yield from (f"{path} is left" for path in _scratch(out))
 
     def _start(

@@ -16,6 +16,7 @@ from flangeye.errors import CalibrationRefused, NothingSeen, StageError
 from flangeye.plugin.registry import Registry
 from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.restart import restart_hint
+from flangeye.workflow.run.runner import Runner
 from tests import toy
 from tests.conftest import TOY_RECIPE, replaced
 
@@ -34,6 +35,26 @@ def test_the_same_recipe_gives_the_same_result_bit_for_bit(execute: Callable[...
 def test_a_solver_that_stops_pulling_stops_the_acquisition(execute: Callable[..., Any]) -> None:
     execute(TOY_RECIPE.replace("- solve.toy", "- solve.toy: {at_most: 4}"))
     assert toy.acquired == ["000", "001", "002", "003"]
+
+
+def test_devices_are_closed_also_if_no_capture_is_asked_for(toy_registry: Registry) -> None:
+    # As by a solver that has enough from the earlier run's captures: an arm left open would be
+    # guarded until the program's end, whose last heartbeat kills it
+    plain, closed = toy.acquire.function, list[str]()
+
+    class Opened(t.Captures):
+        def close(self) -> None:
+            super().close()
+            closed.append("arm")
+
+    def opened(seed, params):
+        made = plain(seed, params)
+        return Opened(iter(made), made.source, made.total)
+
+    recipe = parse_recipe(TOY_RECIPE, "toy", toy_registry)
+    with replaced(toy.acquire, opened):
+        assert Runner(recipe, toy_registry, t.ArchivePath()).take(0) == []
+    assert closed == ["arm"]
 
 
 def test_a_capture_without_joint_angles_is_set_aside_with_the_reason(

@@ -141,7 +141,9 @@ class Runner:
 
     def _acquire(self) -> t.Captures | t.Observations:
         stream: t.Captures | t.Observations = self._call(self._steps("acquire")[0])
-        self._values[t.Look] = stream.look if isinstance(stream, t.Captures) else None
+        if isinstance(stream, t.Captures):  # to be closed also if nobody asks for the first one
+            self._captures = stream
+        self._values[t.Look] = None if self._captures is None else self._captures.look
         return stream
 
     def _taken(self, stream: t.Captures | t.Observations) -> Iterator[t.Observation]:
@@ -179,7 +181,6 @@ class Runner:
     def _fitted(self, stream: t.Captures) -> Iterator[t.Observation]:
         acquire = self._steps("acquire")[0]
         label = acquire.label
-        self._captures = stream
         captures: Iterator[t.Capture | t.Rejection] = iter(stream)
         if self._may_work_ahead(stream):
             captures = self._working = self._ahead(stream)
