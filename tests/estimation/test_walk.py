@@ -73,7 +73,7 @@ def test_a_camera_in_hand_whose_world_drifts_is_found(seed):
     session, camera = solved("hand", seed, 2e-3, 0.3e-3)
     off, square = error(session, camera)
     assert square < chi2_quantile(0.999, 6) / 6
-    assert any(isinstance(note, Warn) and "drifts" in note for note in session.notes)
+    assert any(isinstance(note, Warn) and "drift" in note for note in session.notes)
     assert off < 0.7e-3
 
 

@@ -103,11 +103,24 @@ def test_where_no_new_pose_can_be_worked_out_the_work_is_the_session() -> None:
     far = Box(np.array([9.0, 0.0, 0.0]), np.full(3, 0.1))
     assert all_of_session(work_of(problem, places, far), problem)
     carrier = problem.carriers[0]
-    for carriers in ([], [replace(carrier, joints=None)], [replace(carrier, kinematics=None)],
-                     [replace(carrier, link=3)], [carrier, carrier]):  # fmt: skip
+    for carriers in ([], [replace(carrier, link=3)], [carrier, carrier]):
         work = work_of(replace(problem, carriers=carriers), places, far)
         assert all_of_session(work, problem)
         require_predicted(work.poses, places)
+
+
+@pytest.mark.parametrize("unknown", [{"joints": None}, {"kinematics": None}])
+def test_where_no_joints_are_known_the_work_fills_its_box_all_the_same(unknown: Any) -> None:
+    problem, places = session()
+    arm = replace(problem.carriers[0], **unknown)
+    work = work_of(replace(problem, carriers=[arm]), places)
+    known = work_of(problem, places)
+    assert work.boxes.shape == (8, 256) and len(flanges(known.around)) <= 256
+    require_predicted(work.around, places)
+    # The same boxes, where a pose out of reach is not left out
+    low, high = (each(flanges(known.around)[:, :3, 3], axis=0) for each in (np.min, np.max))
+    assert (flanges(work.around)[:, :3, 3].min(axis=0) <= low + 1e-12).all()
+    assert (flanges(work.around)[:, :3, 3].max(axis=0) >= high - 1e-12).all()
 
 
 def test_the_sighting_that_is_chosen_leaves_least_and_then_counts() -> None:

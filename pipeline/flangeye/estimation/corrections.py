@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.estimation.effects.arm import displacements
+from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.graph import Carrier
+from flangeye.estimation.graph import Carrier, Linear
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
 from flangeye.types import ArmCorrection, Floats
@@ -78,14 +78,16 @@ def _as_field(found: Estimate, carrier: Carrier) -> Floats:
 
     They fit at the session's poses by least squares; the rigid part stays in the camera's pose.
     """
-    places = _places(found, carrier)
-    field, rest = field_over(places), np.zeros((len(places), 3))
-    if carrier.joints is not None and carrier.kinematics is not None:
-        mean = found.posterior.mean[found.posterior.model.p :]
-        for kind, columns in displacements(carrier).items():
-            rows = _rows(found, carrier, kind)
-            if kind not in CORRECTED and rows is not None:
-                rest += columns[:, 3:] @ mean[rows]
+    problem, field = found.problem, field_over(_places(found, carrier))
+    eye = np.tile(np.eye(6), (len(problem.seen), 1, 1))
+    alone = {c.frame: eye * (c is carrier) for c in problem.carriers}
+    ends = np.cumsum([found.posterior.model.p, *found.counts])
+    rest = np.zeros((len(eye), 3))
+    for effect, first, end in zip(found.effects, ends, ends[1:], strict=False):
+        if effect.cause == carrier.arm and effect.kind not in {*CORRECTED, COMMON}:
+            columns = effect.block(problem, Linear(np.zeros(0), np.zeros(0), alone))
+            rest += columns[:, 3:] @ found.posterior.mean[first:end]
+    places = _places(found, carrier)[problem.seen.times]
     # The rigid part is in the camera's pose already: left in here it would be corrected twice
     motions = levers(places - field.about).reshape(-1, 6)
     bent = rest.ravel() - motions @ np.linalg.lstsq(motions, rest.ravel(), rcond=1e-9)[0]

@@ -104,9 +104,10 @@ def likely(
     # Median distance [m] and spread of its logarithm, from the flange of what an arm carries, and
     # from its base of what stands: as tools and cells are, with room for either to be odd
     held, away = (0.12, 0.8), (0.9, 0.5)
-    # Log odds from which places decide between two readings, and from which errors do: the priors
-    # of the errors' sizes alone make odds of one or two thousand
-    told, likelier = np.log(20.0), np.log(1e4)
+    # Log odds from which places decide between two readings, and from which errors do: of exact
+    # poses the priors of the errors' sizes alone make odds of up to a hundred thousand, and noise
+    # of 0.1 mrad makes 10^15
+    told, likelier = np.log(20.0), np.log(1e6)
     whole = bool(np.isfinite(pairs.marker).all())
     plausible = {
         reading: _odds(standing if inverse else carried, *held)

@@ -15,10 +15,10 @@ from flangeye.estimation.effects.clock import clock_effects, delayed
 from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.effects.scanner import scanner_effects
 from flangeye.estimation.effects.target import offset_shown_to, target_effects, wrong_offset
-from flangeye.estimation.effects.walk import innovations, serial_correlation
+from flangeye.estimation.effects.walk import innovations
 from flangeye.estimation.estimate import Estimate, estimate, model_at
 from flangeye.estimation.graph import Carrier, Places, Problem
-from flangeye.estimation.mixed import TELLING, fit, mode_of, whitened
+from flangeye.estimation.mixed import TELLING, fit, mode_of
 from flangeye.estimation.observability import (
     IN_LINE,
     fewest_sightings,
@@ -340,11 +340,11 @@ def _with_walk(session: Session) -> Session:
     problem, model = found.problem, found.posterior.model
     if len(problem.ends) > 1 or (problem.seen.ranks < 6).any():
         return session
-    white = whitened(model, found.fit.sizes)
-    left = white.errors - white.rows @ found.fit.mean
-    # Either the piecewise linear drift takes it up, or the noise does: white noise of sixteen poses
-    # has this correlation once in a thousand sessions
-    if not (found.outgrown("drift", 1.0) or serial_correlation(problem, left) > 0.3):
+    still, *walks = (
+        fit(innovations(replace(problem, walk=(w, w)), model).subsampled(), found.fit.sizes).cost
+        for w in (0.0, 0.4, 1.0)
+    )
+    if still < min(walks):
         return session
     mode, costs = mode_of(model), {}
     for walk in product((0.0, 0.4, 0.7, 0.9, 1.0), repeat=2):

@@ -37,8 +37,8 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     """Return simulated sightings over the work, of the same targets by the same cameras.
 
     The session's poses are too few to show the arm's error between them. So the boxes are filled
-    evenly, with the flange oriented as in the session, where the arm reaches. With several arms, or
-    unknown joint angles, the poses are those of the session.
+    evenly, with the flange oriented as in the session, where the arm reaches; with unknown joint
+    angles, everywhere. With several arms the poses are those of the session.
 
     Args:
         problem: The session's sightings that agree.
@@ -50,8 +50,8 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     chosen = np.unique(np.linspace(0, n - 1, min(n, COUNT)).round().astype(int))
     session = _simulated(problem.where(chosen), places)
     carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
-    # A new pose is reached through the joints of one arm's flange; all else keeps its poses
-    if carrier is None or carrier.link is not None or not joints_known(carrier):
+    # One arm's flange can be sent to new poses; all else keeps those of the session
+    if carrier is None or carrier.link is not None:
         return _all_of(session)
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
@@ -94,10 +94,13 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
     session = np.asarray(problem.frames[carrier.frame].place)
     poses = session[problem.seen.times[like]].copy()
     poses[:, :3, 3] = box[0] + (box[1] - box[0]) * evenly[:, :3]
-    apart = np.linalg.norm(poses[:, None, :3, 3] - session[:, :3, 3], axis=2)
-    arm, joints = kinematics_and_joints(carrier)
-    # Started at the nearest recorded posture, the arm keeps its branch (elbow up or down)
-    joints, reached = reached_from(arm, poses, joints[apart.argmin(axis=1)])
+    reached, joints = np.ones(len(poses), dtype=bool), None
+    if joints_known(carrier):
+        apart = np.linalg.norm(poses[:, None, :3, 3] - session[:, :3, 3], axis=2)
+        arm, joints = kinematics_and_joints(carrier)
+        # Started at the nearest recorded posture, the arm keeps its branch (elbow up or down)
+        joints, reached = reached_from(arm, poses, joints[apart.argmin(axis=1)])
+        joints = joints[reached]
     if not reached.any():
         return problem
     frame = replace(problem.frames[carrier.frame], place=poses[reached])
@@ -105,7 +108,7 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
     return replace(
         problem,
         frames={**problem.frames, carrier.frame: frame},
-        carriers=[replace(carrier, joints=joints[reached], rates=None)],
+        carriers=[replace(carrier, joints=joints, rates=None)],
         seen=replace(seen, times=np.arange(len(seen))),
     )
 

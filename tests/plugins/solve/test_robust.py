@@ -157,14 +157,14 @@ def test_exact_centres_give_the_exact_pose(seed: int, n: int) -> None:
     np.testing.assert_allclose(found.matrix, TRUTH.matrix, atol=1e-6)
 
 
+@pytest.mark.parametrize("turned", [True, False])
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=4)
-def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
+def test_moving_the_base_moves_the_answer_and_nothing_else(turned: bool, seed: int) -> None:
     observations = simulate(15, seed, wrong=2, normal=1e-3)
     rng = np.random.default_rng(seed)
-    motion = Transform(
-        "there", BASE, rigid(rotation_exp(rng.standard_normal(3)), rng.standard_normal(3))
-    )
+    turn = rotation_exp(turned * rng.standard_normal(3))
+    motion = Transform("there", BASE, rigid(turn, rng.standard_normal(3)))
     moved = [
         Observation(
             o.id, o.circle, by_frame(Transform(BASE, FLANGE, (motion @ o.base_T_flange).matrix))
@@ -172,8 +172,12 @@ def test_moving_the_base_moves_the_answer_and_nothing_else(seed: int) -> None:
         for o in observations
     ]
     here, there = solve(observations), solve(moved)
-    expected = motion @ here.base_T_camera.transform
-    np.testing.assert_allclose(there.base_T_camera.transform.matrix, expected.matrix, atol=1e-7)
+    # As reported, the answer is for a box of the work, whose sides keep to the axes of the base
+    pairs = [(here.true[0].transform, there.true[0].transform)]
+    if not turned:
+        pairs.append((here.base_T_camera.transform, there.base_T_camera.transform))
+    for found, again in pairs:
+        np.testing.assert_allclose(again.matrix, (motion @ found).matrix, atol=1e-7)
     assert [p.used for p in here.pairs] == [p.used for p in there.pairs]
 
 
@@ -320,16 +324,14 @@ def test_the_stated_region_holds_the_truth(kind: dict[str, Any]) -> None:
     assert inside >= 0.95 - 0.12  # three standard deviations of 30 runs
 
 
-TOO_WIDE = pytest.mark.xfail(
-    strict=True, reason="97.3 to 99.7 %: no arm is taken for so good a one"
-)
+TOO_WIDE = pytest.mark.xfail(strict=True, reason="99.6 %: no arm is taken for so good a one")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "n"),
     [
-        ({}, 8), pytest.param({}, 20, marks=TOO_WIDE), ({"normal": 1e-3}, 8), ({"normal": 1e-3}, 20),
+        ({}, 8), ({}, 20), ({"normal": 1e-3}, 8), ({"normal": 1e-3}, 20),
         *(pytest.param({"depth": 0.1}, n, marks=TOO_WIDE) for n in (8, 20)),
     ],
 )  # fmt: skip

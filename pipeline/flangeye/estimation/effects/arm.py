@@ -32,10 +32,18 @@ ARM_ERRORS = {
 """Typical size of each kind for zeros of 1 rad: encoders once a turn [rad], a joint's deflection
 for a metre of lever [rad/m], lengths [m], twists [rad]. Ratios seen in published calibrations of
 industrial arms (Nubiola & Bonev 2013; the zeros and lengths of ``refine.arm``), rounded."""
-ANEW = {"base": (1.0, 0.5), "flange": (1.2, 0.15), "each": (0.4, 0.1)}
+ANEW = {
+    "base": (1.0, 0.5),
+    "flange": (1.2, 0.15),
+    "rotation": (1.7, 0.5),
+    "translation": (1.0, 0.17),
+    "each": (0.4, 0.1),
+}
 """Typical rotation [rad] and translation [m] of the arm's error if the joints are unknown: at the
-base and at the flange, common to all poses, and of each pose alone. Values of a UR5e and a Panda
-with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35 deg."""
+base and at the flange, common to all poses. Then by how much its rotation changes with position
+[rad/m] and orientation [rad/rad], and its translation with both [m/m, m/rad]. Values of a UR5e and
+a Panda with errors of all these kinds (``tests/estimation/foreign.py``), over 240 mm and 20 to 35
+deg. Last, the rotation and translation of each pose alone, of an arm that repeats to 0.03 mm."""
 COMMON = "common"
 """Kind of the errors common to all poses, which do not matter in reported coordinates."""
 ACCURACY = 0.3e-3
@@ -70,6 +78,9 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
             for at in ("base", "flange")
             for rows, size in zip((slice(3), slice(3, 6)), ANEW[at], strict=True)
         ]
+        bent = _bent(arm, np.asarray(problem.frames[carriers[0].frame].place))
+        name = "error from pose to pose"
+        effects.append(Effect(name, bent, accuracy, QUALITY_SPREAD, arm, True))
     field = field_over(np.asarray(problem.frames[carriers[0].frame].place)[:, :3, 3])
     block = _by_place(arm, field)
     return [
@@ -100,21 +111,21 @@ class Scatter:
 def arm_scatters(problem: Problem) -> list[Scatter]:
     """Return the arms' noise from pose to pose.
 
-    Backlash depends on the direction of approach. With unknown joint angles, errors that are smooth
-    in the joints count as noise too, unless they are smooth in the flange's position.
+    Backlash depends on the direction of approach. With unknown joint angles, what is not linear in
+    the pose counts as noise too. What an arm repeats to says nothing of how true it is: this noise
+    has a quality of its own.
     """
     out = []
     for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
         if _joints_of_all_known(problem, arm):
             # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
-            # mm by ISO 9283 at a reach of a metre has 0.03 mrad. What an arm repeats
-            # to says nothing of how true it is: it has a quality of its own
+            # mm by ISO 9283 at a reach of a metre has 0.03 mrad
             out.append(Scatter(_backlash(arm), 0.1 * accuracy, QUALITY, ""))
         else:
             turns, shifts = (_pose_noise(arm, rows) for rows in (slice(3), slice(3, 6)))
             turned, shifted = ANEW["each"]
-            out.append(Scatter(turns, turned * accuracy, QUALITY_SPREAD, arm))
-            out.append(Scatter(shifts, shifted * accuracy, QUALITY_SPREAD, arm))
+            out.append(Scatter(turns, turned * accuracy, QUALITY, ""))
+            out.append(Scatter(shifts, shifted * accuracy, QUALITY, ""))
     return out
 
 
@@ -171,6 +182,27 @@ def _in_common(arm: str, at_base: bool, rows: slice) -> Block:
             else:
                 motions[:, :3, :3] = motions[:, 3:, 3:] = poses[:, :3, :3]
             out += linear.blocks[c.frame] @ motions[:, :, rows]
+        return out
+
+    return block
+
+
+def _bent(arm: str, session: Floats) -> Block:
+    """Return the design block of an error that is linear in the pose, about a session's mean."""
+    middle, turned = session[:, :3, 3].mean(axis=0), session[:, :3, :3].mean(axis=0)
+    changes = [ANEW["rotation"], ANEW["translation"]]
+
+    def block(problem: Problem, linear: Linear) -> Floats:
+        out = np.zeros((len(problem.seen), 6, 36))
+        for c in (c for c in problem.carriers if c.arm == arm):
+            poses = np.asarray(problem.frames[c.frame].place)[problem.seen.times]
+            twice = poses[:, :3, :3] @ turned.T
+            skew = (twice - np.swapaxes(twice, 1, 2))[:, (2, 0, 1), (1, 2, 0)] / 2
+            by = np.stack([poses[:, :3, 3] - middle, skew], axis=1)
+            # Each of the twist's six numbers by the six of the pose
+            sizes = np.repeat(changes, 3, axis=0)[:, :, None] * by[:, None]
+            rows = np.eye(6)[:, :, None] * sizes.reshape(len(by), 1, 6, 6)
+            out += linear.blocks[c.frame] @ rows.reshape(len(by), 6, 36)
         return out
 
     return block

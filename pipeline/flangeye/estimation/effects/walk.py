@@ -7,7 +7,6 @@ import numpy as np
 from flangeye.estimation.graph import Problem
 from flangeye.estimation.mixed import LinearModel
 from flangeye.models.cell import chain
-from flangeye.types import Floats
 from flangeye.types.geometry import hat
 
 
@@ -40,9 +39,3 @@ def innovations(problem: Problem, model: LinearModel) -> LinearModel:
         drift = back[k] @ (predicted + model.shares[k] * stays * rows[k])
     rows = out @ rows
     return replace(model, residuals=rows[..., 0], design=rows[..., 1:])
-
-
-def serial_correlation(problem: Problem, errors: Floats) -> float:
-    """Return the correlation of (6 N,) white errors of sightings with those of the next ones."""
-    each = errors.reshape(-1, 6)[np.argsort(problem.seen.times)]
-    return float((each[1:] * each[:-1]).sum() / (each**2).sum())
