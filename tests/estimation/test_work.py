@@ -103,7 +103,8 @@ def test_where_no_new_pose_can_be_worked_out_the_work_is_the_session() -> None:
     far = Box(np.array([9.0, 0.0, 0.0]), np.full(3, 0.1))
     assert all_of_session(work_of(problem, places, far), problem)
     carrier = problem.carriers[0]
-    for carriers in ([], [replace(carrier, link=3)], [carrier, carrier]):
+    for carriers in ([], [replace(carrier, link=3)], [replace(carrier, axis=True)],
+                     [carrier, carrier]):  # fmt: skip
         work = work_of(replace(problem, carriers=carriers), places, far)
         assert all_of_session(work, problem)
         require_predicted(work.poses, places)

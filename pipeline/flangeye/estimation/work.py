@@ -38,7 +38,7 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
 
     The session's poses are too few to show the arm's error between them. So the boxes are filled
     evenly, with the flange oriented as in the session, where the arm reaches; with unknown joint
-    angles, everywhere. With several arms the poses are those of the session.
+    angles, everywhere. With several arms, or a rail, the poses are those of the session.
 
     Args:
         problem: The session's sightings that agree.
@@ -50,8 +50,8 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     chosen = np.unique(np.linspace(0, n - 1, min(n, COUNT)).round().astype(int))
     session = _simulated(problem.where(chosen), places)
     carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
-    # One arm's flange can be sent to new poses; all else keeps those of the session
-    if carrier is None or carrier.link is not None:
+    # One arm's flange can be sent to new poses; a rail goes along its line, and all else stays
+    if carrier is None or carrier.link is not None or carrier.axis:
         return _all_of(session)
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
