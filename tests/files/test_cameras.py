@@ -131,7 +131,7 @@ def test_several_cameras_in_a_file_are_said(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(text + text.replace("cam0", "cam1").replace("1201.5", "900"))
     camera = camera_in(tmp_path / "a.yaml")
     assert camera is not None
-    assert camera.note().endswith("5 coefficients; the first of 2 in it")
+    assert camera.note().endswith("5 coefficients; the first of 2 cameras in this file")
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_a_stereo_pairs_first_camera_is_taken(
     assert camera is not None
     assert np.allclose(camera.matrix, K)
     assert np.allclose(camera.distortion, LENS)
-    assert camera.note().endswith("5 coefficients; the first of 2 in it")
+    assert camera.note().endswith("5 coefficients; the first of 2 cameras in this file")
 
 
 @pytest.mark.parametrize("named", ["K", "IntrinsicMatrix", "FocalLength"])

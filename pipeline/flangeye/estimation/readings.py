@@ -104,10 +104,9 @@ def likely(
     # Median distance [m] and spread of its logarithm, from the flange of what an arm carries, and
     # from its base of what stands: as tools and cells are, with room for either to be odd
     held, away = (0.12, 0.8), (0.9, 0.5)
-    # Log odds from which places decide between two readings, and from which errors do: of exact
-    # poses the priors of the errors' sizes alone make odds of up to a hundred thousand, and noise
-    # of 0.1 mrad makes 10^15
-    told, likelier = np.log(20.0), np.log(1e6)
+    # Log odds from which places decide between two readings, and from which errors do: the priors
+    # of the errors' sizes alone make odds of one or two thousand
+    told, likelier = np.log(20.0), np.log(1e4)
     whole = bool(np.isfinite(pairs.marker).all())
     plausible = {
         reading: _odds(standing if inverse else carried, *held)
@@ -183,6 +182,10 @@ def _costs(readings: list[Reading], pairs: Pairs, robot: RobotModel | None) -> F
         kept[np.flatnonzero(kept)[~agree]] = False
         found = [_estimated(each.of(pairs), kept, robot) for each in readings]
     costs = [0.5 * each.posterior.cost if each else np.inf for each in found]
+    left = [each.problem.residuals(each.places)[each.inliers] for each in found if each]
+    # Exact poses, to a micrometre, have no noise to tell by: the priors alone would decide
+    if left and max(np.abs(each).max(initial=0.0) for each in left) < 1e-6:
+        costs = [0.0 if each else np.inf for each in found]
     return np.zeros(len(costs)) if np.isinf(costs).all() else np.array(costs)
 
 

@@ -468,8 +468,11 @@ def test_a_hostile_frame_stays_a_string(name: str, frame: str) -> None:
     try:
         text = stage(pose=CalibratedPose(BENIGN), params=params).text
     except StageError as error:
-        assert name in ("urdf", "ros2_command")
-        assert str(error).startswith(f"export.{name}: a name cannot be written as ")
+        why = {
+            "urdf": "a name cannot be written as XML: ",
+            "ros2_command": "a frame name cannot be quoted for a shell",
+        }
+        assert str(error).startswith(f"export.{name}: {why[name]}")
         return
     found = OF_FRAMES[name](text)
     if name == "urdf":

@@ -251,7 +251,7 @@ def test_a_file_without_triangles_is_no_cad(tmp_path: Path) -> None:
     path = write_plate(tmp_path, -0.015)
     (tmp_path / "plate.stl").write_bytes(b"solid nothing\nendsolid nothing\n")
     with pytest.raises(
-        StageError, match=r"plate.stl: holds no triangles; is it a mesh, and whole\?"
+        StageError, match=r"plate.stl: holds no triangles; is it a mesh, and is the file complete\?"
     ):
         load_workpiece(path)
 

@@ -89,5 +89,5 @@ def test_a_scan_of_another_scanner_is_refused() -> None:
 
 
 def test_a_cad_is_registered_to_one_place_alone() -> None:
-    with pytest.raises(CalibrationRefused, match="put together from 2 places"):
+    with pytest.raises(CalibrationRefused, match="stitched from 2 places"):
         seam_cad(on_flange(), scan_of_the_plate(), CadParams(workpiece="v-straight"), None, PHOXI)
