@@ -127,7 +127,7 @@ def test_of_an_arm_whose_joints_are_unknown_the_base_and_the_flange_are_off() ->
         ("place of the base", 0.15e-3, 1.8, "arm", True, True, False),
         ("place of the flange", 0.36e-3, 1.8, "arm", True, True, False),
         ("place of the flange", 0.045e-3, 1.8, "arm", True, True, False),
-        ("error from pose to pose", 0.3e-3, 1.8, "arm", True, True, False),
+        ("error linear in the pose", 0.3e-3, 1.8, "arm", True, True, False),
         ("smooth error", 0.03e-3, 4.0, "arm", True, True, False),
         *DRIFT,
     ]

@@ -149,8 +149,7 @@ class _Commands:
         """Rigid motion (B, 6, K) of each carrier's frame, about its arm base's origin."""
         still, out = np.zeros((len(self.work.seen), 6, 6)), {}
         for carrier in self.work.carriers:
-            blocks = {c.frame: still + np.eye(6) * (c is carrier) for c in self.work.carriers}
-            twists = self._columns(Linear(np.zeros(0), np.zeros(0), blocks), "of_arm")
+            twists = self._columns(self.work.following(carrier), "of_arm")
             places = np.asarray(self.work.frames[carrier.frame].place)[self.work.seen.times, :3, 3]
             motions = still + np.eye(6)
             motions[:, 3:, :3] = -hat(places)

@@ -8,7 +8,7 @@ import numpy as np
 
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.graph import Carrier, Linear
+from flangeye.estimation.graph import Carrier
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
 from flangeye.types import ArmCorrection, Floats
@@ -79,14 +79,11 @@ def _as_field(found: Estimate, carrier: Carrier) -> Floats:
     They fit at the session's poses by least squares; the rigid part stays in the camera's pose.
     """
     problem, field = found.problem, field_over(_places(found, carrier))
-    eye = np.tile(np.eye(6), (len(problem.seen), 1, 1))
-    alone = {c.frame: eye * (c is carrier) for c in problem.carriers}
+    linear, rest = problem.following(carrier), np.zeros((len(problem.seen), 3))
     ends = np.cumsum([found.posterior.model.p, *found.counts])
-    rest = np.zeros((len(eye), 3))
     for effect, first, end in zip(found.effects, ends, ends[1:], strict=False):
         if effect.cause == carrier.arm and effect.kind not in {*CORRECTED, COMMON}:
-            columns = effect.block(problem, Linear(np.zeros(0), np.zeros(0), alone))
-            rest += columns[:, 3:] @ found.posterior.mean[first:end]
+            rest += effect.block(problem, linear)[:, 3:] @ found.posterior.mean[first:end]
     places = _places(found, carrier)[problem.seen.times]
     # The rigid part is in the camera's pose already: left in here it would be corrected twice
     motions = levers(places - field.about).reshape(-1, 6)

@@ -213,6 +213,12 @@ class Problem:
                     blocks[name][rows] = block
         return Linear(residuals, turns, blocks)
 
+    def following(self, carrier: Carrier) -> Linear:
+        """Return the linearisation whose blocks give twists (N, 6) of one carrier's own frame."""
+        eye = np.tile(np.eye(6), (len(self.seen), 1, 1))
+        blocks = {c.frame: eye * (c is carrier) for c in self.carriers}
+        return Linear(np.zeros(0), np.zeros(0), blocks)
+
     def _at(self, places: Places, times: Indices) -> dict[str, Frame]:
         """Return the frames at some times, all places known."""
         out = {}

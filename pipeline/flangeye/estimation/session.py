@@ -340,9 +340,10 @@ def _with_walk(session: Session) -> Session:
     problem, model = found.problem, found.posterior.model
     if len(problem.ends) > 1 or (problem.seen.ranks < 6).any():
         return session
+    # At the sizes found without a walk, which is quick; only where one is likelier, all are tried
     still, *walks = (
-        fit(innovations(replace(problem, walk=(w, w)), model).subsampled(), found.fit.sizes).cost
-        for w in (0.0, 0.4, 1.0)
+        fit(each.subsampled(), found.fit.sizes).cost
+        for each in (model, *(innovations(replace(problem, walk=(w, w)), model) for w in (0.4, 1)))
     )
     if still < min(walks):
         return session

@@ -79,7 +79,7 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
             for rows, size in zip((slice(3), slice(3, 6)), ANEW[at], strict=True)
         ]
         bent = _bent(arm, np.asarray(problem.frames[carriers[0].frame].place))
-        name = "error from pose to pose"
+        name = "error linear in the pose"
         effects.append(Effect(name, bent, accuracy, QUALITY_SPREAD, arm, True))
     field = field_over(np.asarray(problem.frames[carriers[0].frame].place)[:, :3, 3])
     block = _by_place(arm, field)

@@ -141,7 +141,8 @@ class Runner:
 
     def _acquire(self) -> t.Captures | t.Observations:
         stream: t.Captures | t.Observations = self._call(self._steps("acquire")[0])
-        if isinstance(stream, t.Captures):  # to be closed also if nobody asks for the first one
+        if isinstance(stream, t.Captures):
+            # Its devices are open from now on, also if the solver never asks for a capture
             self._captures = stream
         self._values[t.Look] = None if self._captures is None else self._captures.look
         return stream
