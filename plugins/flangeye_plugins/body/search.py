@@ -302,6 +302,12 @@ class FoundPose(NamedTuple):
     weakest: float
     seen: float
 
+    @property
+    def rivalled_from(self) -> float:
+        """Number of agreeing rays from which another pose may explain as much."""
+        # Refined, a pose may explain more than twice as many rays
+        return 0.4 * self.verdict.agree
+
 
 @dataclass(frozen=True, eq=False)
 class BodySearch:
@@ -343,18 +349,29 @@ class BodySearch:
             scores = self.looks.scores(poses, self._coarse, count, tolerance)
             poses = poses[distinct(poses, scores, self.looks)[:left]]
         found = self.near(poses)
-        return self._distinct(found + self.near(self._twins(found[0]))) if found else []
-
-    def near(self, poses: Floats) -> list[FoundPose]:
-        """Return the best of the poses (K, 4, 4), refined on the scan's points, best first."""
-        if not len(poses):
+        if not found:
             return []
-        scores = [judged(self.looks, self._fine, pose, self._rough).rank for pose in poses]
-        poses = poses[distinct(poses, np.array(scores), self.looks)[:8]]
-        best, others = self._laid(poses[0]), poses[1:]
+        # Turned by a cube's rotations, the best may explain as much
+        best = found[0]
+        turned = self.near(self.looks.twins(best.pose), best.rivalled_from)
+        return self._distinct(found + turned)
+
+    def near(self, poses: Floats, least: float = 0.0) -> list[FoundPose]:
+        """Return the best of the poses (K, 4, 4), refined on the scan's points, best first.
+
+        Only those with which at least ``least`` rays agree.
+        """
+        verdicts = [judged(self.looks, self._fine, pose, self._rough) for pose in poses]
+        agree = np.array([one.agree for one in verdicts], int)
+        ranks = np.array([one.rank for one in verdicts])
+        kept = np.flatnonzero(agree >= least)
+        if not len(kept):
+            return []
+        kept = kept[distinct(poses[kept], ranks[kept], self.looks)[:8]]
+        best, others = self._laid(poses[kept[0]]), kept[1:]
         if best and self.passes(best):
-            others = self._rivals(others, best)
-        return self._distinct([one for one in (best, *map(self._laid, others)) if one])
+            others = others[agree[others] >= best.rivalled_from]
+        return self._distinct([one for one in (best, *map(self._laid, poses[others])) if one])
 
     def refuted(self, pose: Floats, near: Callable[[Floats], Mask]) -> float:
         """Return the share of a part of the body that the scan contradicts by seeing through it.
@@ -375,8 +392,7 @@ class BodySearch:
 
     def images(self, found: FoundPose) -> list[FoundPose]:
         """Return left-handed poses of the mirrored body that fit the scan nearly as well."""
-        poses = self.looks.reflections(found.pose)
-        return self.near(self._as_well(poses, 0.9 * found.verdict.agree))
+        return self.near(self.looks.reflections(found.pose), 0.9 * found.verdict.agree)
 
     def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
         """Return the poses for which no rival explains the same cells and one more patch."""
@@ -433,20 +449,6 @@ class BodySearch:
         depth = fit.pose[2, :3] @ self.looks.centre + fit.pose[2, 3]
         seen = float(verdict.agree * (self._fine.angle * depth) ** 2 / self.looks.broadest)
         return FoundPose(fit.pose, verdict, fit.weakest(self.looks.symmetry.freedoms), seen)
-
-    def _twins(self, best: FoundPose) -> Floats:
-        """Return the pose, turned by a cube's rotations, where the scan is explained as well."""
-        return self._rivals(self.looks.twins(best.pose), best)
-
-    def _rivals(self, poses: Floats, best: FoundPose) -> Floats:
-        """Return the poses, out of (K, 4, 4), that may explain as much as the best one does."""
-        # Refined, a pose may explain more than twice as many rays
-        return self._as_well(poses, 0.4 * best.verdict.agree)
-
-    def _as_well(self, poses: Floats, least: float) -> Floats:
-        """Return the poses, out of (K, 4, 4), with which more than ``least`` rays agree."""
-        agree = [judged(self.looks, self._fine, pose, self._rough).agree for pose in poses]
-        return np.asarray(poses[np.array(agree, int) > least])
 
     def _distinct(self, found: list[FoundPose]) -> list[FoundPose]:
         poses = np.array([one.pose for one in found]).reshape(-1, 4, 4)

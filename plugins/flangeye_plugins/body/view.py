@@ -31,7 +31,7 @@ class CoarseImage:
         """Depth (H, W) along z [m]."""
         return self.xyz[..., 2]
 
-    @property
+    @cached_property
     def directions(self) -> Floats:
         """Directions (H, W, 3) of the rays through the cells' centres, with z = 1."""
         rows, columns = self.xyz.shape[:2]
@@ -64,24 +64,35 @@ class CoarseImage:
 
         The direction points to the cell from the mean of the surface's cells around it.
         """
-        total, count, open_side = np.zeros_like(self.xyz), np.zeros(self.xyz.shape[:2]), None
-        normals = self.normals
-        for shift in _ring(2):
+        # Where a neighbouring cell is farther off than the surface can go on, or empty
+        open_side = np.zeros(self.xyz.shape[:2], bool)
+        for shift in _ring(1):
             way = _shifted(self.xyz, shift) - self.xyz
-            same = np.abs(way[..., 2]) < _gate(self.depth, self.angle, max(map(abs, shift)))
-            # A table right behind a plate's edge is not the plate: it lies off its plane.
-            off = np.abs(np.einsum("ijk,ijk->ij", way, normals))
-            same &= off < np.linalg.norm(way, axis=-1) / 2 + 3 * self.noise
-            total += np.where(same[..., None], way, 0.0)
+            open_side |= ~self._same(way, self.normals, self.depth, 1) & ~(way[..., 2] < 0.0)
+        row, column = np.nonzero(open_side)
+        own, normals = self.xyz[row, column], self.normals[row, column]
+        padded = np.pad(self.xyz, ((2, 2), (2, 2), (0, 0)), constant_values=np.nan)
+        total, count = np.zeros_like(own), np.zeros(len(own))
+        for dy, dx in _ring(2):
+            way = padded[row + 2 + dy, column + 2 + dx] - own
+            same = self._same(way, normals, own[:, 2], max(abs(dy), abs(dx)))
+            total += np.where(same[:, None], way, 0.0)
             count += same
-            if max(map(abs, shift)) == 1:
-                beyond = ~same & ~(way[..., 2] < 0.0)
-                open_side = beyond if open_side is None else open_side | beyond
-        across = -total / np.maximum(count, 1)[..., None]
-        across -= np.einsum("ijk,ijk->ij", across, normals)[..., None] * normals
-        length = np.linalg.norm(across, axis=-1)
-        found = open_side & (length > 0.25 * self.angle * self.depth) & (count >= 6)
-        return found & np.isfinite(length), _unit(across)
+        across = -total / np.maximum(count, 1)[:, None]
+        across -= np.einsum("nk,nk->n", across, normals)[:, None] * normals
+        length = np.linalg.norm(across, axis=1)
+        found = (length > 0.25 * self.angle * own[:, 2]) & (count >= 6)
+        row, column = row[found], column[found]
+        mask, directions = np.zeros_like(open_side), np.full_like(self.xyz, np.nan)
+        mask[row, column], directions[row, column] = True, _unit(across[found])
+        return mask, directions
+
+    def _same(self, way: Floats, normals: Floats, depth: Floats, cells: int) -> Mask:
+        """Return the mask (...) of steps (..., 3) that stay on a surface, so many cells across."""
+        # A table right behind a plate's edge is not the plate: it lies off its plane
+        off = np.abs(np.einsum("...k,...k->...", way, normals))
+        same = np.abs(way[..., 2]) < _gate(depth, self.angle, cells)
+        return np.asarray(same & (off < np.linalg.norm(way, axis=-1) / 2 + 3 * self.noise))
 
     @cached_property
     def nearest_end(self) -> Indices:
