@@ -42,7 +42,7 @@ from flangeye.types import (
     Warn,
 )
 from flangeye.units import param
-from flangeye.workflow.log.read import RunLog
+from flangeye.workflow.log.read import RunLog, is_log
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
@@ -62,7 +62,7 @@ class OpeningParams(Params):
 
 
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
-    """Return the path of the archive.
+    """Return the path of the archive; of a run's folder, its log's.
 
     Raises:
         StageError: No path is given, or it does not exist.
@@ -72,7 +72,8 @@ def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
         raise StageError(f"{stage}: no archive given; add --archive PATH, or path: in the recipe")
     if not path.exists():
         raise StageError(f"{path}: does not exist")
-    return path
+    log = path / "run.mcap"
+    return log if is_log(log) else path
 
 
 def open_archive(path: Path, params: OpeningParams) -> Archive:

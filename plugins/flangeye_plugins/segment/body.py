@@ -209,9 +209,12 @@ def _misdrawn(
     from flangeye_plugins.body.view import view_of
 
     for what, fix, other in _otherwise(body):
-        if any(map(passes, BodySearch(points, prepared(other), passes).quickly())):
+        righted = filter(passes, BodySearch(points, prepared(other), passes).quickly())
+        if found := next(righted, None):
             return Rejected(
-                f"{body.name} is {what}: with a corrected mesh it would be found", fix=fix
+                f"{body.name} is {what}: with a corrected mesh it would be found",
+                f"{found.verdict.shown:.0%} of the rays that should hit the corrected mesh do",
+                fix,
             )
     shape = prepared(body)
     vertices, facets = shape.facets

@@ -118,14 +118,17 @@ def test_poses_can_be_left_out(acquire: Callable[..., Any]) -> None:
     assert "left out as the recipe states: two, check" in stream.source.notes
 
 
-def test_a_log_is_an_archive(acquire: Callable[..., Any], captures: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("named", [".", "run.mcap"])
+def test_a_run_is_an_archive(
+    acquire: Callable[..., Any], captures: Any, tmp_path: Path, named: str
+) -> None:
     path = tmp_path / "run.mcap"
     recorder = Recorder(path, {}, full_clouds=True)
     recorder.flangeye_run_started(source=Source("before", ("as it was told",)), total=5)
     for capture in captures:
         recorder.flangeye_captured(step="0.acquire.x", capture=capture, seconds=0.0)
     recorder.close()
-    stream = acquire(path)
+    stream = acquire(tmp_path / named)
     assert all(map(same, stream, captures))
     assert stream.source.notes == (f"archive: {path}, a log of flangeye", "as it was told")
     assert stream.source.fingerprint != "before"

@@ -596,6 +596,8 @@ def test_what_all_scans_share_is_told_alone() -> None:
     diagnosis = examine(spoilt, CHECKS)
     assert diagnosis.findings == (wrong,)
     assert diagnosis.notes == (aside,)
+    known = "by itself in each of these samples: a, b"
+    assert combined_fix(diagnosis.findings) == (wrong.what, known, ["mirror it"])
     nothing = session.centres * np.nan
     few = replace(session, centres=nothing, remarks=(aside,))
     with pytest.raises(StageError, match=r"0 of 20 samples .*; 2 of them: segment.body: two poses"):

@@ -36,13 +36,16 @@ def _idle(diagnosis: Diagnosis) -> list[str]:
 def _details(finding: Finding) -> list[str]:
     lines = []
     if finding.samples:
-        listed = 8  # of more samples, the rest is counted
-        shown = ", ".join(finding.samples[:listed])
-        more = len(finding.samples) - listed
-        lines.append(f"   samples: {shown}" + (f" and {more} more" if more > 0 else ""))
+        lines.append(f"   samples: {_samples(finding)}")
     if evidence := evidence_of(finding):
         lines.append(f"   evidence: {evidence}")
     return [*lines, *fix_lines(finding, "   ")]
+
+
+def _samples(finding: Finding) -> str:
+    listed = 8  # of more samples, the rest is counted
+    more = len(finding.samples) - listed
+    return ", ".join(finding.samples[:listed]) + (f" and {more} more" if more > 0 else "")
 
 
 def evidence_of(finding: Finding) -> str:
@@ -67,7 +70,11 @@ def combined_fix(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
     wrong = "; and ".join(finding.what for finding in together)
     known = "; then ".join(filter(None, map(evidence_of, together)))
     steps = ["\n  ".join(sorted(lines.values()))] if len(lines) > 1 else together[-1].choices
-    return wrong, known and f"re-solved with the correction: {known}", steps
+    if known:
+        known = f"re-solved with the correction: {known}"
+    elif together[0].samples:
+        known = f"by itself in each of these samples: {_samples(together[0])}"
+    return wrong, known, steps
 
 
 def fix_lines(finding: Finding, indent: str) -> list[str]:
