@@ -6,8 +6,10 @@ sample over the rooms below, each in a copy of the repository, under those fast 
 line (coverage.py says which, and is asked anew for a file of tests that has changed, into
 build/mutation), the file's own first, then the fastest: in a fork of a process that has them
 collected (tools/trying.py). A change of what is computed at import, or of a line that runs in
-processes of the tests alone, is tried in a new process as well. A change that fails no test is a
-survivor: its place and what was changed are printed, and the share that was killed.
+processes of the tests alone, is tried in a new process as well. What the tests that are named leave
+alive is tried under the room's other files too, in a new process: coverage would make whole
+calibrations too slow. A change that fails no test is a survivor: its place and what was changed are
+printed, and the share that was killed.
 """
 
 from __future__ import annotations
@@ -112,10 +114,10 @@ def mutations(room: str) -> Iterator[Mutation]:
     for path in sorted((ROOT / ROOMS[room][0]).rglob("*.py")):
         source, file = path.read_text("utf-8"), str(path.relative_to(ROOT))
         tree = ast.parse(source)
-        lines, later = _statements(tree), _in_functions(tree)
+        lines, later, same = _statements(tree), _in_functions(tree), _free_sizes(tree)
         for number, node in enumerate(ast.walk(tree)):
             line = getattr(node, "lineno", 0)
-            for words, change in _changes(node):
+            for words, change in () if node in same else _changes(node):
                 yield Mutation(
                     room, file, source, line, lines[node], number, words, change, node not in later
                 )
@@ -138,6 +140,17 @@ def _in_functions(tree: ast.Module) -> set[Any]:
     """Return the nodes that a fork's functions have: those of bodies, not of default values."""
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     return {node for each in functions for part in each.body for node in ast.walk(part)}
+
+
+def _free_sizes(tree: ast.Module) -> set[Any]:
+    """Return the ones of ``reshape(-1, …)``: numpy takes any negative number alike."""
+    shapes = [
+        argument
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and getattr(call.func, "attr", "") == "reshape"
+        for argument in call.args
+    ]
+    return {each.operand for each in shapes if isinstance(each, ast.UnaryOp)}
 
 
 def _changes(node: Any) -> Iterator[tuple[str, Callable[[Any], Any]]]:
@@ -324,22 +337,25 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(Path(folder))
         for room in asked.room:
+            others = _others(room, asked.tests)
             ROOMS[room] = (ROOMS[room][0], *(asked.tests or ROOMS[room][1:]))
             chosen = _chosen(room, asked.sample // len(asked.room), asked.seed, asked.only)
             if not chosen:
                 continue
             tests = copy.tests(room)
             copy.collect(room)
-            alive = _survivors(copy, chosen, tests, asked.budget)
+            alive = _survivors(copy, chosen, (tests, others), asked.budget)
             copy.close()
             print(f"{room:10} {len(chosen) - alive:3} of {len(chosen):3} killed", flush=True)
             killed, tried = killed + len(chosen) - alive, tried + len(chosen)
     print(f"{killed} of {tried} killed by fast tests ({killed / max(tried, 1):.0%})")
 
 
-def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) -> int:
+def _survivors(
+    copy: Copy, chosen: list[Mutation], known: tuple[Tests, list[str]], budget: float
+) -> int:
     """Print the changes that no test notices and return how many they are."""
-    alive = 0
+    alive, (tests, others) = 0, known
     unchanged = chosen[0]._replace(change=lambda node: None)
     named = tests.of(unchanged.file, unchanged.lines, budget)
     if copy.killed_in_fork(unchanged, named) or copy.killed(unchanged, named):
@@ -348,7 +364,10 @@ def _survivors(copy: Copy, chosen: list[Mutation], tests: Tests, budget: float) 
         print(f"\r{number} of {len(chosen)} ", end="", file=sys.stderr, flush=True)
         named = tests.of(mutation.file, mutation.lines, budget)
         if not (
-            copy.killed_in_fork(mutation, named) or _killed_anew(copy, mutation, tests, budget)
+            copy.killed_in_fork(mutation, named)
+            or _killed_anew(copy, mutation, tests, budget)
+            # Nobody knows how long each of these takes: a minute [CPU s]
+            or (others and copy.killed(mutation, dict.fromkeys(others, 60.0)))
         ):
             alive += 1
             print(f"  alive {mutation.file}:{mutation.line}: {mutation.words}", flush=True)
@@ -364,6 +383,13 @@ def _killed_anew(copy: Copy, mutation: Mutation, tests: Tests, budget: float) ->
         return True
     others = tests.but(named, budget)
     return bool(others) and copy.killed(mutation, others)
+
+
+def _others(room: str, named: list[str]) -> list[str]:
+    """Return the room's files of tests beside those that are named; none where none is named."""
+    files = [file for place in ROOMS[room][1:] for file in _test_files(ROOT / place)]
+    every = [str(file.relative_to(ROOT)) for file in files]
+    return [file for file in every if file not in named] if named else []
 
 
 def _chosen(room: str, count: int, seed: int, only: str) -> list[Mutation]:
