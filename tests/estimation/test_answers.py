@@ -19,9 +19,11 @@ from flangeye.estimation.answers import (
     commanded,
     expected_error,
 )
-from flangeye.estimation.effects.arm import displacements
+from flangeye.estimation.corrections import corrected_part, corrections_of
+from flangeye.estimation.effects.arm import COMMON, displacements
 from flangeye.estimation.estimate import Estimate
 from flangeye.estimation.work import Work, work_of
+from flangeye.maths.arm_correction import corrected_flange
 from flangeye.types import Floats
 from flangeye.types.geometry import hat, invert, levers, rigid, rotation_exp, rotation_log
 from tests.estimation import foreign
@@ -180,3 +182,58 @@ def test_of_twenty_errors_one_is_larger_than_its_quantile_whatever_the_scale_of_
         np.array([exact, 1e4 * exact]),
     )  # fmt: skip
     assert expected_error(far, none).p95 == pytest.approx(800 * 0.95 / 0.97, abs=2.0)
+
+
+def displaced(found: Estimate, numbers: Floats) -> Floats:
+    """Return (N, 3) how far errors of these sizes displace the flange, but those of all poses."""
+    problem, each = found.problem, np.split(numbers, np.cumsum(found.counts)[:-1])
+    linear = problem.following(problem.carriers[0])
+    moved = [
+        e.block(problem, linear)[:, 3:] @ part
+        for e, part in zip(found.effects, each, strict=True)
+        if e.of_arm and e.kind != COMMON
+    ]
+    return np.asarray(np.sum(moved, axis=0))
+
+
+def require_taken_off(found: Estimate, kinds: set[str]) -> None:
+    """Fail where a correction leaves more of an arm's errors than a rigid motion and a rest."""
+    problem, (carrier,) = found.problem, found.problem.carriers
+    tool, numbers = np.array([0.0, 0.02, 0.1]), found.posterior.mean[found.posterior.model.p :]
+    ((arm, told),) = corrections_of(found, tool).items()
+    assert arm == carrier.arm
+    poses = np.asarray(problem.frames["flange"].place)
+    joints = [None] * len(poses) if carrier.joints is None else carrier.joints
+    after = np.array([
+        corrected_flange(pose, q, told, carrier.kinematics)
+        for pose, q in zip(poses, joints, strict=True)
+    ])  # fmt: skip
+    moved = after[:, :3, 3] - after[:, :3, :3] @ tool - poses[:, :3, 3]
+    taken = displaced(found, corrected_part(found))
+    np.testing.assert_allclose(moved, taken, atol=2e-6)
+    alone = displaced(
+        found,
+        np.where(np.repeat([e.kind in kinds for e in found.effects], found.counts), numbers, 0),
+    )
+    motions = levers(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)).reshape(-1, 6)
+
+    def rigid_part(moved: Floats) -> Floats:
+        return np.asarray(motions @ np.linalg.lstsq(motions, moved.ravel(), rcond=None)[0])
+
+    def bent(moved: Floats) -> float:
+        return float(np.linalg.norm(moved.ravel() - rigid_part(moved)))
+
+    every, added = displaced(found, numbers), taken - alone
+    assert bent(every - taken) < 0.6 * bent(every - alone)
+    assert np.linalg.norm(rigid_part(added)) < 0.3 * bent(added)
+
+
+def test_a_correction_takes_off_what_bends_the_work_and_leaves_rigid_motions(session: Any) -> None:
+    require_taken_off(session[1], {"zeros", "lengths", "twists", "field"})
+
+
+def test_of_an_arm_whose_joints_are_unknown_a_correction_is_a_field_alone() -> None:
+    found = estimated(foreign.session("marker", foreign.UR5E, 1e-3, 12, 1), "marker", told=False)
+    require_taken_off(found, {"field"})
+    (told,) = corrections_of(found, np.zeros(3)).values()
+    assert told.field is not None and told.joint_offsets is None and told.lengths is None

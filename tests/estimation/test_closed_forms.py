@@ -187,6 +187,20 @@ def test_alternation_only_climbs() -> None:
     assert errors_by_round == sorted(errors_by_round, reverse=True)
 
 
+def test_several_problems_are_alternated_at_once_as_each_would_be_alone() -> None:
+    rng = np.random.default_rng(14)
+    given = tuple(np.array([[rotation(rng) for _ in range(6)] for _ in range(3)]) for _ in range(3))
+    starts = random_rotations(rng, (3,))
+    together, errors_of = alternate((given[0], given[1], given[2]), starts, rounds=4)
+    for k in range(3):
+        alone, error = alternate(
+            (given[0][k], given[1][k], given[2][k]), (starts[0][k], starts[1][k], starts[2][k]), 4
+        )
+        for one, other in zip(alone, together, strict=True):
+            np.testing.assert_allclose(one, other[k], atol=1e-9)
+        assert error == pytest.approx(errors_of[k])
+
+
 @pytest.mark.parametrize(
     "name",
     [

@@ -50,6 +50,13 @@ def test_the_middle_one_is_told_with_its_deviation(middle: float, rotation: floa
     assert said.endswith("in 5 poses); the camera's pose does not depend on it")
 
 
+@pytest.mark.parametrize("middle", [-140.0, -20.0, 12.0, 70.0, 180.0])
+def test_the_middle_one_of_a_wide_scatter_is_told(middle: float) -> None:
+    """Angles a third of a turn apart, wherever the half turn lies among them."""
+    said = roll_note(seen(np.radians(middle + np.array([-50, -20, 0, 30, 60]))), CAMERA, STILL)
+    assert f"frame: {middle:.2f} +- " in said
+
+
 def test_the_holes_of_two_poses_tell_nothing() -> None:
     every = seen(np.full(5, 0.2))
     for one in every[:3]:

@@ -61,6 +61,7 @@ def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -
     shares = posterior.model.shares.copy()
     shares[fold] = 0.0
     others = posterior.model.weighted(shares)
+    assert posterior.without(fold).model.shares.tolist() == shares.tolist()
     for known, left in zip(posterior.fits, posterior.without(fold).fits, strict=True):
         again = fit(others, known.sizes)
         assert left.mean == pytest.approx(again.mean, rel=1e-6, abs=1e-12)
