@@ -28,6 +28,7 @@ from flangeye.workflow.log.foxglove import (
     points_of,
     seam_poses,
     seam_scene,
+    write_rerun_blueprint,
 )
 from flangeye.workflow.log.record import Recorder
 from flangeye.workflow.recipe.load import parse_recipe
@@ -97,6 +98,18 @@ def test_what_a_camera_on_the_arm_sees_is_in_base_by_the_arm_s_pose(tmp_path: Pa
         np.testing.assert_allclose(points, (pose @ carried).apply(xyz), atol=1e-6)
 
 
+def test_a_small_grid_of_points_is_shown_whole(tmp_path: Path) -> None:
+    grid = np.arange(60, dtype=np.float32).reshape(4, 5, 3)
+    recorder = Recorder(tmp_path / "run.mcap", {}, False)
+    pose = t.by_frame(t.Transform(t.BASE, t.FLANGE, np.eye(4)))
+    recorder.flangeye_captured("0", t.Capture("0", t.PointCloud(t.CAMERA, grid), pose), 0.1)
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        ((_, _, _, shown),) = reader.iter_decoded_messages(topics=["/capture/cloud"])
+    np.testing.assert_array_equal(points_of(shown), grid.reshape(20, 3))
+
+
 def test_of_each_flange_in_base_four_thousand_points_are_shown(tmp_path: Path) -> None:
     place = t.Transform(t.BASE, t.CAMERA, np.eye(4))
     recorder = Recorder(tmp_path / "run.mcap", {"recipe.yaml": "title: T"}, False)
@@ -115,6 +128,10 @@ def test_a_foxglove_layout_shows_topics_that_are_logged(flangeye: Any, tmp_path:
     assert set(CLOUD_TOPICS) <= set(shown)
     named = json.dumps(layout["layout"])
     assert all(panel in named for panel in layout["configById"])
+    # Most of the window is the cell's; beside it the image has a little less than the messages
+    shares = layout["layout"]["splitPercentage"], layout["layout"]["second"]["splitPercentage"]
+    assert shares == (65, 45) and layout["playbackConfig"] == {"speed": 1}
+    assert (tmp_path / "l.json").read_text().startswith('{\n  "')
 
 
 def test_foxgloves_own_classes_write_the_same_panels() -> None:
@@ -155,6 +172,21 @@ def test_a_rerun_blueprint_is_written(flangeye: Any, tmp_path: Path) -> None:
     assert (read.returncode, "1 file verified without error" in read.stderr) == (0, True)
 
 
+def test_in_rerun_the_cell_is_twice_as_wide_as_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rrb = pytest.importorskip("rerun.blueprint", reason="rerun-sdk is not installed")
+    made, plain = list[Any](), rrb.Horizontal
+
+    def beside(*views: Any, **how: Any) -> Any:
+        made.append(how)
+        return plain(*views, **how)
+
+    monkeypatch.setattr(rrb, "Horizontal", beside)
+    write_rerun_blueprint(tmp_path / "l.rbl")
+    assert made == [{"column_shares": [2, 1]}]
+
+
 def test_a_rerun_blueprint_is_that_of_the_logs_name(tmp_path: Path) -> None:
     """Rerun takes a log's file name for its application, and a layout of another is not used."""
     assert RunFolder(tmp_path).log.stem == "run"
@@ -187,8 +219,8 @@ def drawn(update: Any, frame: str) -> list[Any]:
     (entity,) = update.entities
     assert (entity.frame_id, entity.timestamp.ToNanoseconds()) == (frame, 5)
     for line in entity.lines:
-        assert line.scale_invariant and line.thickness >= 1.0 and line.color.a == 1.0
-        assert (line.color.r, line.color.g, line.color.b) == pytest.approx(colour, abs=0.01)
+        assert line.scale_invariant and line.color.a == 1.0
+        assert (line.color.r, line.color.g, line.color.b) == pytest.approx(colour, abs=1e-6)
         assert line.pose.orientation.w == 1.0
     return [np.array([[p.x, p.y, p.z] for p in line.points]) for line in entity.lines]
 
@@ -205,6 +237,7 @@ def require_ring(ring: Any, centre: Any, axis: Any, radius: float, points: int) 
 def test_a_circle_is_drawn_as_a_ring_for_each_radius_and_three_centimetres_of_its_normal() -> None:
     assert circle_scene("7", CIRCLE, 5).entities[0].id == "circle/7"
     rim, bore, normal = drawn(circle_scene("7", CIRCLE, 5), "camera")
+    assert [line.thickness for line in circle_scene("7", CIRCLE, 5).entities[0].lines] == 3 * [2.0]
     for ring, radius in ((rim, 0.03), (bore, 0.016)):
         require_ring(ring, CIRCLE.centre, NORMAL, radius, 73)
     np.testing.assert_allclose(normal[0], CIRCLE.centre)
@@ -222,6 +255,8 @@ def test_a_circle_s_points_are_dense_and_without_a_normal_its_centre_alone() -> 
 
 def test_a_seam_is_drawn_with_rings_about_it_and_its_poses_lead_along_and_into_the_groove() -> None:
     line, *rings = drawn(seam_scene(SEAM, 5), "base")
+    thick = [each.thickness for each in seam_scene(SEAM, 5).entities[0].lines]
+    assert thick == [3.0, 1.0, 1.0, 1.0]
     np.testing.assert_allclose(line, SEAM.points_in_base)
     assert [round(float(ring[:, 1].mean()), 9) for ring in rings] == [0.0, 0.2, 0.4]
     poses = seam_poses(SEAM, 5)

@@ -1,5 +1,7 @@
 """The log survives: a killed run, a damaged file, a full disk."""
 
+import errno
+import io
 import os
 import signal
 import subprocess
@@ -14,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from mcap.reader import make_reader
 
 from flangeye import types as t
 from flangeye.errors import StageError
@@ -158,8 +161,6 @@ def test_an_image_is_a_png_in_the_log_and_comes_back_bit_for_bit(
 
 
 def test_viewers_find_foxglove_schemas_and_frames(tmp_path: Path) -> None:
-    from mcap.reader import make_reader
-
     recorder = recorded(tmp_path / "r.mcap")
     recorder.flangeye_run_finished({})
     with (tmp_path / "r.mcap").open("rb") as file:
@@ -174,8 +175,6 @@ def test_viewers_find_foxglove_schemas_and_frames(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("full", [True, False])
 def test_whole_scans_are_kept_where_they_are_asked_for(tmp_path: Path, full: bool) -> None:
-    from mcap.reader import make_reader
-
     recorded(tmp_path / "r.mcap", full).flangeye_run_finished({})
     with (tmp_path / "r.mcap").open("rb") as file:
         topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
@@ -183,7 +182,11 @@ def test_whole_scans_are_kept_where_they_are_asked_for(tmp_path: Path, full: boo
     assert ("/capture/scan" in topics) == full
 
 
-@pytest.mark.parametrize(("count", "told"), [(1, ""), (2, " (and 1 more)"), (12, " (and 11 more)")])
+@pytest.mark.parametrize(
+    ("count", "told"),
+    [(1, ""), (2, " (and 1 more)"), (10, " (and 9 more)"), (11, " (and 10 more)"),
+     (12, " (and 11 more)")],
+)  # fmt: skip
 def test_how_much_is_damaged_is_said(count: int, told: str) -> None:
     log = RunLog(Path("r.mcap"))
     log.require_sound()
@@ -193,7 +196,8 @@ def test_how_much_is_damaged_is_said(count: int, told: str) -> None:
     said = "r.mcap: damaged: 0; kept: 0 captures, 0 values of steps"
     assert str(error.value) == said + told
     assert log.notes[0] == said
-    assert log.notes[10:] == ["r.mcap: damaged: and 2 more"] * (count == 12)
+    left = max(0, count - 10)
+    assert log.notes[10:] == [f"r.mcap: damaged: and {left} more"] * (left > 0)
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.5, 0.8, 0.99])
@@ -229,6 +233,50 @@ def test_what_is_no_log_is_said(tmp_path: Path) -> None:
         read_run(tmp_path / "text.mcap")
     (tmp_path / "empty.mcap").write_bytes(b"")
     assert not read_run(tmp_path / "empty.mcap").gathered
+
+
+def test_a_log_that_cannot_be_read_to_its_end_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken(io.BytesIO):
+        def read(self, size: int | None = -1) -> bytes:
+            raise OSError(errno.EIO, "Input/output error")
+
+    recorded(tmp_path / "r.mcap").close()
+    monkeypatch.setattr("flangeye.workflow.log.read.open_regular", lambda path: Broken())
+    with pytest.raises(StageError, match=r"r.mcap: cannot be read: Input/output error$"):
+        read_run(tmp_path / "r.mcap")
+
+
+def test_a_result_is_text_for_people(tmp_path: Path) -> None:
+    recorded(tmp_path / "r.mcap").flangeye_run_finished({"status": "verified", "of": "Größe"})
+    told = read_run(tmp_path / "r.mcap").text("result.json")
+    assert told == '{\n  "status": "verified",\n  "of": "Größe"\n}\n'
+
+
+def test_where_a_capture_shows_a_marker_viewers_are_told_and_not_where_it_shows_none(
+    tmp_path: Path,
+) -> None:
+    marker = t.PoseFeature(t.Transform(t.CAMERA, t.TARGET, np.eye(4)), np.eye(6))
+    recorder = Recorder(tmp_path / "r.mcap", {}, False)
+    for capture in ("a", None):
+        recorder.flangeye_stage_finished("2.fit.toy", capture, marker, 0.2)
+        recorder.flangeye_stage_finished("2.fit.toy", capture, CIRCLE, 0.2)
+    recorder.flangeye_run_finished({})
+    with (tmp_path / "r.mcap").open("rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert [topics.count(each) for each in ("/tf", "/scene", "/circle")] == [1, 1, 1]
+
+
+def test_a_capture_that_cannot_be_read_is_set_aside_by_the_stage_that_took_it(
+    tmp_path: Path,
+) -> None:
+    recorded(tmp_path / "r.mcap").close()
+    log = read_run(tmp_path / "r.mcap")
+    log.poses["a"]["shape"] = [5, 3]  # of four points
+    (told,) = log.readings()
+    assert isinstance(told, t.Rejection)
+    assert (told.id, told.stage) == ("a", "acquire.toy")
 
 
 @given(arrays(np.float64, (3, 3), elements=st.floats(-1e9, 1e9)), st.floats(0, 1))

@@ -6,6 +6,7 @@ import threading
 import time
 from contextlib import nullcontext, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -174,6 +175,33 @@ def test_the_last_six_events_are_shown() -> None:
     assert view.events == [f"event {number}" for number in range(2, 8)]
 
 
+def test_labels_and_texts_stand_in_two_columns() -> None:
+    console = plain()
+    console.print(RunView("2026_toy").rendered())
+    lines = [line.rstrip() for line in console.export_text().splitlines()]
+    # Two blanks beside the longest label, "error so far", and no empty line between
+    assert lines[:2] == ["run           2026_toy", "captures      0, 0 fitted"]
+
+
+def test_a_log_is_looked_at_ten_times_a_second(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    Recorder(tmp_path / "run.mcap", {}, False).close()
+    slept, now = list[float](), [0.0]
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        now[0] += seconds
+
+    clock = SimpleNamespace(sleep=sleep, monotonic=lambda: now[0], time=lambda: now[0])
+    monkeypatch.setattr("flangeye.workflow.log.watch.time", clock)
+    for name in ("run.mcap", "nowhere.mcap"):
+        slept.clear()
+        with pytest.raises(StageError):
+            watch_run(tmp_path / name, None, plain(), patience=0.25)
+        assert slept == [0.1, 0.1, 0.1]
+
+
 def test_an_arm_under_way_is_shown_in_millimetres_with_its_mode(log: Any) -> None:
     path, _ = log
     pose = np.eye(4)
@@ -294,6 +322,22 @@ def test_the_address_behind_the_gate_is_any_of_the_loopback_s(
     host, port = hidden_address()
     assert asked == [2**24] and port > 1023  # one that the system chose
     assert host in ("127.1.2.3", "127.0.0.1")  # the second where a system has no other
+
+
+def test_where_a_system_has_one_loopback_address_the_port_is_free_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real = socket.create_server
+
+    def only(address: tuple[str, int]) -> socket.socket:
+        if address[0] != "127.0.0.1":
+            raise OSError
+        return real(address)
+
+    monkeypatch.setattr("secrets.randbelow", lambda below: 0x010203)
+    monkeypatch.setattr(socket, "create_server", only)
+    host, port = hidden_address()
+    assert host == "127.0.0.1" and port > 1023
 
 
 def test_a_port_that_is_taken_is_one_line(log: Any) -> None:

@@ -81,7 +81,7 @@ class LogMessage(NamedTuple):
     channel: Channel
     time_ns: int
     data: bytes
-    number: int = 0
+    number: int
 
 
 class NotMcapError(ValueError):

@@ -338,7 +338,7 @@ async def _joined(
 
 async def _handed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     with suppress(OSError):
-        while data := await reader.read(1 << 16):
+        while data := await reader.read(65_536):
             writer.write(data)
             await writer.drain()
 
