@@ -152,6 +152,7 @@ def test_the_history_comes_back_as_it_was(cell: Path, tmp_path: Path) -> None:
     read = History.read(history, stored.key)
     last = read.findings.pop()
     assert judge(stored, read, DriftTest(limit=0.4e-3)) == last
+    assert (last.since, last.part, last.probability) == (None, "", 0.0)
     assert [f.check for f in read.findings] == [0, 1, 2]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,15 @@ import pytest
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import CheckSightings
+from flangeye.estimation.watch.drift import CheckSightings, DriftTest, DriftVerdict, Information
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import corners_of
 from flangeye.models.loading import load_model
 from flangeye.plugin.registry import load_registry
+from flangeye.types import Floats
 from flangeye.types.geometry import rotation_exp
-from flangeye.workflow.doctor.monitor import from_archive
+from flangeye.workflow.doctor.monitor import from_archive, verdicts
+from flangeye.workflow.doctor.monitor.history import CheckFinding, History, MonitorCheck
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
 from tests.workflow.doctor.monitor.cell import WORKSPACE, calibrate, check
 
@@ -79,6 +82,62 @@ def test_a_shift_shows_in_the_base_and_a_tilt_across_the_flange_s_axis(
     assert (np.diagonal(told.covariances[2])[3:] > 1e3 * np.diagonal(told.covariances[1])[3:]).all()
 
 
+def test_a_sighting_has_the_noise_of_its_scan_and_of_the_arm(stored: StoredCalibration) -> None:
+    (told,) = sightings(stored, where_it_should_be(stored, 1)).covariances
+    # Alike in all directions, of a centre and across a normal
+    own = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6])
+    np.testing.assert_allclose(told, own + stored.pose_error.beyond, atol=1e-12)
+
+
+def compared(
+    stored: StoredCalibration, monkeypatch: pytest.MonkeyPatch, since: int | None
+) -> Callable[[int, int], tuple[Floats, Floats]]:
+    """Return what the last of six checks is compared with, from which one on, by how many.
+
+    Or, where something moved at a check, what those since are.
+    """
+    told: list[Information] = []
+    every = [
+        MonitorCheck(f"{k}", tuple(changed(o, centre=o.circle.centre + [1e-5 * (k + 1), 0, 0])
+                                   for o in where_it_should_be(stored)))
+        for k in range(6)
+    ]  # fmt: skip
+
+    def heard(before: Information, answer: Any) -> Any:
+        told.append(before)
+        return answer
+
+    if since is None:
+        fine = CheckFinding(0, "OK", 0.0, (0.0,) * 6, None, 0.5)
+        monkeypatch.setattr(verdicts, "judge", lambda *_: fine)
+        monkeypatch.setattr(verdicts, "misfits", lambda seen, before, _: heard(before, np.False_))
+    parts = {"scanner": 1.0, "flange": 0.0, "arm": 0.0}
+    monkeypatch.setattr(verdicts, "attribute_change", lambda before, *_: heard(before, parts))
+
+    def before(first: int, reference: int) -> tuple[Floats, Floats]:
+        test, found = DriftTest(reference=reference), History(Path("h"), "key", every[first:5])
+        moved = DriftVerdict("MOVED", np.zeros(6), np.eye(6), 1e-3, (since or 0) - first, 2.0)
+        monkeypatch.setattr(verdicts, "verdict", lambda *_: moved)
+        verdicts.take(stored, found, every[5], test)
+        return told[-1].matrix, told[-1].vector
+
+    return before
+
+
+@pytest.mark.parametrize("since", [None, 5])
+def test_a_check_is_compared_with_so_many_checks_before_it_and_with_all_of_fewer(
+    stored: StoredCalibration, monkeypatch: pytest.MonkeyPatch, since: int | None
+) -> None:
+    before = compared(stored, monkeypatch, since)
+
+    def same(one: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> bool:
+        return all(np.allclose(a, b, rtol=1e-9) for a, b in zip(one, other, strict=True))
+
+    assert same(before(0, 2), before(3, 2)) and same(before(3, 2), before(3, 9))
+    assert not same(before(0, 3), before(0, 2)) and not same(before(3, 9), before(4, 9))
+    assert not same(before(4, 9), before(5, 9))  # that one is the first of all
+
+
 def test_the_joints_move_the_circle_as_the_arm_does(stored: StoredCalibration) -> None:
     seen = where_it_should_be(stored)
     told = sightings(stored, seen)
@@ -126,7 +185,19 @@ def test_the_key_tells_calibrations_apart_by_a_nanometre(stored: StoredCalibrati
         return replace(stored, calibration=replace(stored.calibration, camera=there)).key
 
     assert moved(0.0) == stored.key != moved(2e-9)
-    assert "\n" not in stored.key
+    assert moved(1e-11) == stored.key and "\n" not in stored.key
+
+
+def test_recordings_in_a_file_are_no_log_and_a_log_that_is_not_there_is_said(
+    stored: StoredCalibration, tmp_path: Path
+) -> None:
+    recipe = b"title: T\nrobot: ur5e\nsteps: [acquire.archive, segment.flange, fit.rim, solve.svd]"
+    log = replace(stored.log, attachments={"recipe.resolved.yaml": recipe})
+    (tmp_path / "poses.csv").write_text("1, 2, 3")
+    for name, told in (("none.mcap", "none.mcap: does not exist"), ("poses.csv", r"poses.csv:1: ")):
+        with pytest.raises(StageError, match=told) as error:
+            from_archive(tmp_path / name, replace(stored, log=log), load_registry())
+        assert "MCAP" not in str(error.value)
 
 
 @pytest.mark.parametrize("began_ns", [10**18, 0])

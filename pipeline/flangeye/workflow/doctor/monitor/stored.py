@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -50,7 +51,7 @@ class StoredCalibration:
     def key(self) -> str:
         """Key that is unique to this calibration."""
         return np.array2string(
-            self.estimate.transform.matrix.ravel(), precision=9, max_line_width=999
+            self.estimate.transform.matrix.ravel(), precision=9, max_line_width=sys.maxsize
         )
 
     @cached_property
