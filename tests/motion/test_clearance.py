@@ -78,6 +78,7 @@ def of_capsules(*links: tuple[int, float, float]) -> tuple[ArmVolume, Any]:
         ([(1, 0.0, 0.0), (3, 0.09, 0.0)], True),  # joined by the link between them
         ([(1, 0.0, 0.0), (4, 0.09, 0.0)], False),
         ([(4, 0.0, 0.0), (1, 0.09, 0.0)], False),
+        ([(1, 0.0, 0.0), (4, 0.1, 0.0)], False),  # they touch
         ([(1, 0.0, 0.0), (4, 0.11, 0.0)], True),
         ([(1, 0.0, 0.0), (2, 0.5, 0.0), (6, 0.09, 0.23)], False),  # the ends count, and all pairs
     ],
@@ -100,10 +101,28 @@ def test_all_that_moves_stays_above_the_table(links: Any, above: bool) -> None:
     assert volume.above(axes, 0.3) is above
 
 
-@pytest.mark.parametrize(("room", "away"), [(0.0, True), (0.049, True), (0.051, False)])
+def test_what_touches_the_table_is_not_above_it() -> None:
+    for foot, above in ((0.05, False), (0.0501, True)):
+        volume, axes = of_capsules((2, 0.0, foot))
+        assert volume.above(axes, 0.0) is above
+
+
+@pytest.mark.parametrize(
+    ("room", "away"), [(0.0, True), (0.049, True), (0.05, False), (0.051, False)]
+)
 def test_every_link_keeps_its_distance_from_what_stands_there(room: float, away: bool) -> None:
     volume, axes = of_capsules((1, 0.9, 0.0), (6, 0.1, 0.0))
     assert volume.away(axes, np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]), room) is away
+
+
+def test_a_line_of_sight_that_grazes_a_link_is_not_hidden_and_its_width_not_free() -> None:
+    volume, axes = of_capsules((3, 0.0, 0.0))
+    for x, hidden in ((0.0499, True), (0.05, False)):
+        sight = np.array([[[x, -1.0, 0.1], [x, 1.0, 0.1]]])
+        assert volume.hides(axes, sight).tolist() == [hidden]
+    sight = np.array([[[0.1, -1.0, 0.1], [0.1, 1.0, 0.1]]])
+    for width, free in ((0.0499, True), (0.05, False)):
+        assert volume.leaves_free(axes, sight, width) is free
 
 
 def test_segments_on_one_line_and_points_have_their_distance_too() -> None:

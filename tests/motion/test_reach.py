@@ -308,6 +308,17 @@ def test_an_arm_keeps_off_the_scanners_housing() -> None:
         assert Reach(MODEL, scanner(), camera, 0.0)._clear(SHOWN) is clear
 
 
+def test_a_scanner_s_housing_reaches_ten_centimetres_about_its_eyes() -> None:
+    tip = (1.2, 0.0, 0.5)  # of an arm of one small ball, far from the table and the flange
+    ball = Volume(link=0, start=tuple(map(SI, tip)), end=tuple(map(SI, tip)), radius=SI(0.05))
+    robot = MODEL.model_copy(update={"volumes": (ball,)})
+    for away, clear in ((0.149, False), (0.151, True)):
+        camera = OVERHEAD.copy()
+        camera[:3, 3] = np.array(tip) + [away, 0.0, 0.0]
+        beyond = Reach(robot, scanner(), camera, load_body("ring-plate", None, Path()))
+        assert beyond._clear(SHOWN) is clear
+
+
 TORCH = load_body("torch", None, Path())
 
 
