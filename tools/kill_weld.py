@@ -15,7 +15,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +27,7 @@ from flangeye.errors import FlangeyeError
 from flangeye.files.processes import python_command
 from flangeye.workflow.log.read import read_notes
 from tests.emulators.controllers.process import Process
-from tools.strokes import guard_of, worker_of
+from tools.strokes import guard_of, itself, worker_of
 
 RECIPE = "recipes/paper/fig13_straight.yaml"
 FINGER = "steps.5.sensor.simulated_finger"
@@ -53,8 +53,6 @@ class Trial:
     controller: Process
     run: subprocess.Popen[str]
     log: Path
-    chance: random.Random
-    reason: str = ""
 
     def notes(self, name: str) -> Iterator[Any]:
         """Yield the values that the weld has logged under a name so far."""
@@ -111,59 +109,44 @@ Strike = Callable[[Trial], float]
 """Does something to a weld, and returns how long the arm then goes on moving [s]."""
 
 
-def itself(run: int) -> int:
-    """Return the run's own process."""
-    return run
-
-
 def killed(find: Callable[[int], int]) -> Strike:
-    """A process of the weld is killed."""
+    """Return what kills a process of the weld."""
 
     def strike(trial: Trial) -> float:
         os.kill(find(trial.run.pid), signal.SIGKILL)
-        taken = trial.rests()
-        trial.reason = trial.told()
-        return taken
+        return trial.rests()
 
     return strike
 
 
 def hung(find: Callable[[int], int], signals: Callable[[int, int], None] = os.kill) -> Strike:
-    """A process of the weld is held, or the program with its group, until the arm rests."""
+    """Return what holds a process of the weld, or the program with its group, until the arm rests."""
 
     def strike(trial: Trial) -> float:
         process = find(trial.run.pid)
         signals(process, signal.SIGSTOP)
         taken = trial.rests()
         signals(process, signal.SIGCONT)
-        again = trial.rests()  # it must not move once more
-        trial.reason = trial.told()
-        return taken + again
+        return taken + trial.rests()  # it must not move once more
 
     return strike
 
 
-def faulted(trial: Trial) -> float:
-    """The controller reports a protective stop."""
-    trial.controller.control.fault("protective-stop")
-    taken = trial.rests()
-    trial.reason = trial.told()
-    return taken
+def faulted(fault: str) -> Strike:
+    """Return what gives the controller a fault, as ``flangeye emulator`` names it."""
 
+    def strike(trial: Trial) -> float:
+        trial.controller.control.fault(fault)
+        return trial.rests()
 
-def frozen(trial: Trial) -> float:
-    """Freeze the controller for three seconds, in which it sends nothing."""
-    trial.controller.control.fault("freeze=3 s")
-    taken = trial.rests()
-    trial.reason = trial.told()
-    return taken
+    return strike
 
 
 def powerless(trial: Trial) -> float:
     """Kill the controller, which stops the arm; measure the time until the run reports it."""
     trial.controller.send(signal.SIGKILL)
     began = time.monotonic()
-    trial.reason = trial.told()
+    trial.told()
     return time.monotonic() - began
 
 
@@ -173,7 +156,6 @@ def camera(trial: Trial) -> float:
     while trial.run.poll() is None:
         last = time.monotonic() if control.truth().speed > MOVES else last
         time.sleep(LOOK)
-    trial.reason = trial.told()
     return last - max(s["time_ns"] for s in trial.notes("sight") if s["tag"]) * 1e-9
 
 
@@ -188,10 +170,7 @@ class Stroke:
 
 
 def _silent(after: float) -> tuple[str, ...]:
-    return (
-        "--set",
-        f"{FINGER}.hidden=[{after:.1f} s, 1000 s]",
-    )  # at rest after 'still'
+    return ("--set", f"{FINGER}.hidden=[{after:.1f} s, 1000 s]")  # at rest after 'still'
 
 
 def _lost(after: float) -> tuple[str, ...]:
@@ -206,8 +185,8 @@ STROKES = {
     "guard held": Stroke(hung(guard_of)),
     "worker killed": Stroke(killed(worker_of)),
     "worker held": Stroke(hung(worker_of)),
-    "protective stop": Stroke(faulted),
-    "controller frozen": Stroke(frozen),
+    "protective stop": Stroke(faulted("protective-stop")),
+    "controller frozen": Stroke(faulted("freeze=3 s")),
     "controller killed": Stroke(powerless, within=ENDS),
     "camera silent": Stroke(camera, _silent, by_itself=True),
     "camera lost": Stroke(camera, _lost, by_itself=True),
@@ -224,29 +203,23 @@ class Bench:
     def struck(self, stroke: Stroke, lead: float) -> tuple[float, str]:
         """Return the time until the arm was at rest in one weld [s], and the run's message."""
         after = self._chance.uniform(*AFTER)
-        trial = self._begin(stroke.given(lead + after))
-        try:
-            trial.follows()
+        with self._weld(stroke.given(lead + after)) as trial:
             if not stroke.by_itself:
                 time.sleep(after)
-            return stroke.strike(trial), trial.reason
-        finally:
-            self._end(trial)
+            return stroke.strike(trial), trial.told()
 
     def lead(self) -> float:
         """Return when a weld begins to follow, after the first image [s]."""
-        trial = self._begin(PATIENT)
-        try:
-            trial.follows()
+        with self._weld(PATIENT) as trial:
             return trial.lead()
-        finally:
-            self._end(trial)
 
     def close(self) -> None:
         """End the controller."""
         self._controller.end(signal.SIGKILL)
 
-    def _begin(self, given: tuple[str, ...]) -> Trial:
+    @contextmanager
+    def _weld(self, given: tuple[str, ...]) -> Iterator[Trial]:
+        """Begin a weld, and give it once its torch follows the seam; end it with its controller."""
         self._count += 1
         out = self._folder / str(self._count)
         driver = f"robot.driver={{ur_rtde: {{host: {self._controller.host}}}}}"
@@ -255,15 +228,17 @@ class Bench:
             python_command("-m", "flangeye.cli", *words), text=True, start_new_session=True,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
-        return Trial(self._controller, run, out / "run.mcap", self._chance)
-
-    def _end(self, trial: Trial) -> None:
-        with suppress(ProcessLookupError):
-            os.killpg(trial.run.pid, signal.SIGKILL)
-        trial.run.wait()
-        if self._controller.process.poll() is None:
-            self._controller.end(signal.SIGKILL)
-        self._controller = Process("--joints", HOME, model="ur10e")
+        trial = Trial(self._controller, run, out / "run.mcap")
+        try:
+            trial.follows()
+            yield trial
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(run.pid, signal.SIGKILL)
+            run.wait()
+            if self._controller.process.poll() is None:
+                self._controller.end(signal.SIGKILL)
+            self._controller = Process("--joints", HOME, model="ur10e")
 
 
 def main(

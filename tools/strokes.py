@@ -58,6 +58,11 @@ def _child(pid: int, word: str) -> int:
     raise LookupError(f"process {pid} has no child with {word} in its command")
 
 
+def itself(run: int) -> int:
+    """Return the run's own process."""
+    return run
+
+
 def guard_of(run: int) -> int:
     """Return the process that watches a run's arm."""
     return _child(run, "spawn_main")
@@ -121,21 +126,17 @@ def _release(signals: Callable[[int, int], None], process: int) -> None:
         signals(process, signal.SIGCONT)
 
 
-def _itself(run: int) -> int:
-    return run
-
-
 def _interrupted(run: int, terminal: Terminal) -> None:
-    _held(_itself)(run, terminal)
+    _held(itself)(run, terminal)
     terminal.press(b"\x03")
 
 
 STROKES: dict[str, Stroke] = {
-    "program killed": _killed(_itself),
-    "program held": _held(_itself),
+    "program killed": _killed(itself),
+    "program held": _held(itself),
     "guard killed": _killed(guard_of),
     "guard held": _held(guard_of),
-    "process group held": _held(_itself, os.killpg),
+    "process group held": _held(itself, os.killpg),
     "Ctrl-Z": lambda _, terminal: terminal.press(b"\x1a"),
     "program held, Ctrl-C": _interrupted,
 }

@@ -67,19 +67,15 @@ def try_condition(
     """
     true = curved(length)
     plan = Path(misplanned(true, seed, *condition.planned))
-    settings = Following.model_validate(condition.settings)
-    body = built_for(settings)
-    section, prior = known(condition, body, settings)
+    body, prior, nominal = set_up(condition, true)
+    settings = condition.asked
     check_tool(body, prior, settings)
     check_bound(plan, prior, settings)
-    passes = 1 + len(settings.passes)
-    controller = controller_of(plan, prior, settings, "tactile")
+    controller = controller_of(WeldTask(plan, prior, settings), "tactile")
     watch(controller)
-    nominal = Nominal(
-        Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool
-    )
     start = start_at(plan, prior, settings, period)
-    start = replace(start, longest=120.0 * passes, look=condition.look)
+    longest = 120.0 * (1 + len(settings.passes))
+    start = replace(start, longest=longest, look=condition.look)
     return run_trial(controller, nominal, condition.truth, start, seed)
 
 
@@ -89,41 +85,36 @@ def could_be_welded(condition: Condition, seed: int, length: float, period: floa
     The same steering gets the true seam, and tool, arm path and heat as in their files. The
     remaining errors are the arm's delay, backlash and repeatability.
     """
-    settings = Following.model_validate(condition.settings)
-    body = built_for(settings)
-    section, prior = known(condition, body, settings)
-    torch = body.level_R_tool.T @ body.torch
-    nominal = Nominal(Path(curved(length)), section, Tip(), torch, body.level_R_tool)
+    _, prior, nominal = set_up(condition, curved(length))
+    settings = condition.asked
     plan = WeldWorld(nominal, condition.truth, [seed, 0]).groove.root
     arm = replace(condition.truth.arm, wave=0.0, scale=0.0, sag=0.0)
     controller = Follower(WeldTask(plan, prior, settings, touch=False))
-    truth = WeldTruth(arm)
-    controller.arm.dead_time, controller.arm.lag = truth.arm.dead_time, truth.arm.lag
+    controller.arm.dead_time, controller.arm.lag = arm.dead_time, arm.lag
     start = start_at(plan, prior, settings, period)
-    trial = run_trial(controller, replace(nominal, seam=plan), truth, start, seed)
+    trial = run_trial(controller, replace(nominal, seam=plan), WeldTruth(arm), start, seed)
     s, off = trial.column("torch_s"), np.abs(trial.column("torch"))
     beside = (s > 0.0) & (s < trial.length)
     return trial.done and bool((off[beside] <= settings.max_error).mean() >= 0.99)
 
 
-def built_for(settings: Following) -> LeaningTool:
-    """Return a tool whose torch is as high as its tip at the planned lean."""
+def set_up(condition: Condition, true: Floats) -> tuple[LeaningTool, ModelPrior, Nominal]:
+    """Return the tool, the controller's model, and the nominal world of a seam (N, 3)."""
+    settings, section = condition.asked, condition.section
+    # At the planned lean the torch is as high as the tip.
     up = -DISTANCE * np.tan(settings.travel_angle) / np.cos(settings.work_angle)
     torch = np.array([-DISTANCE, 0.0, float(up)])
-    return body_from(torch, settings.sign * settings.work_angle, settings.travel_angle)
-
-
-def known(
-    condition: Condition, body: LeaningTool, settings: Following
-) -> tuple[GrooveSection, ModelPrior]:
-    """Return the planned joint, and the controller's model of tool and joint."""
-    section, half_angle = condition.section, None
+    body = body_from(torch, settings.sign * settings.work_angle, settings.travel_angle)
+    half_angle = None
     if section is None:
         half_angle = condition.half_angle or SECTION.half_angle
         section = GrooveSection(half_angle, SECTION.depth)
     prior = model_prior_of(Finger.model_validate(FINGER), body, half_angle, settings)
     behind = None if condition.look is None else condition.look.behind
-    return section, replace(prior, behind=behind, **condition.prior)
+    nominal = Nominal(
+        Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool
+    )
+    return body, replace(prior, behind=behind, **condition.prior), nominal
 
 
 def start_at(plan: Path, prior: ModelPrior, settings: Following, period: float) -> Start:

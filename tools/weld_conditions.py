@@ -19,6 +19,7 @@ from flangeye_emulators.weld_world.truth import (
     WeldTruth,
     WorkpieceTruth,
 )
+from flangeye_plugins.weld.settings import Following
 
 
 class Condition(NamedTuple):
@@ -41,6 +42,11 @@ class Condition(NamedTuple):
     half_angle: float | None = None
     section: GrooveSection | None = None
     look: ProfilerTruth | None = None
+
+    @property
+    def asked(self) -> Following:
+        """All settings of the controller."""
+        return Following.model_validate(self.settings)
 
 
 FILLET = GrooveSection(np.pi / 4, 30e-3, -np.pi / 4)

@@ -20,7 +20,7 @@ from flangeye_plugins.seam.planned import (
     refuse_outside,
     resampled,
 )
-from flangeye_plugins.seam.register import STAGE, Registered, RegistrationLimits, register
+from flangeye_plugins.seam.register import STAGE, Registered, register
 from flangeye_plugins.seam.stitched import seen_in_base
 
 
@@ -70,7 +70,7 @@ def seam_cad(
             "plan the seam with seam.joint",
         )
     seen = seen_in_base(STAGE, scan, answer, robot)
-    found = register(seen.points, workpiece, seam, _limits(params))
+    found = register(seen.points, workpiece, seam, params.max_residual)
     turn, shift = found.fit.pose[:3, :3], found.fit.pose[:3, 3]
     dense = resampled(np.hstack([seam.points, seam.openings]), SPACING)
     line = dense[:, :3] @ turn.T + shift
@@ -133,10 +133,3 @@ def _figures(found: Registered) -> dict[str, float]:
         "points": float(found.fit.points),
         "edges": float(found.fit.edges),
     }
-
-
-def _limits(params: CadParams) -> RegistrationLimits:
-    # More of a part that is there is seen, though a third of it is covered, and less of the edges
-    # that other parts have alike; a twentieth of what was seen may be missing, and the best pose is
-    # three percent better than the second.
-    return RegistrationLimits(0.25, 0.05, params.max_residual, 0.03)

@@ -23,24 +23,6 @@ AROUND = 0.05
 """Smallest reach of the surface around a seam that must be seen, as a share of the diagonal."""
 
 
-@dataclass(frozen=True)
-class RegistrationLimits:
-    """Limits that a registration must meet to be accepted.
-
-    Attributes:
-        seen: Smallest visible area, as a share of the part's area seen from its broadest side:
-            small areas, like a plate's edge, fit many things.
-        refuted: Largest share of the surface in view that may be missing in the scan.
-        residual: Largest distance of the scan from the CAD, robust standard deviation [m].
-        distinct: Smallest relative difference of score between the best and the second-best pose.
-    """
-
-    seen: float
-    refuted: float
-    residual: float
-    distinct: float
-
-
 @dataclass(frozen=True, eq=False)
 class Registered:
     """A CAD part located in a scan, with the figures that show how well it fits.
@@ -60,9 +42,11 @@ class Registered:
 
 
 def register(
-    points: Floats, workpiece: Workpiece, seam: CadSeam, limits: RegistrationLimits
+    points: Floats, workpiece: Workpiece, seam: CadSeam, max_residual: float
 ) -> Registered:
     """Register a CAD to a scan (N, 3) in ``camera``, without an initial guess.
+
+    ``max_residual`` is the largest robust standard deviation of the scan from the CAD [m].
 
     Raises:
         StageError: The CAD's unit is wrong, as its size does not fit the scan.
@@ -72,37 +56,40 @@ def register(
     # Measured points lie before the scanner; others are invalid.
     scan = points[points[:, 2] > 0.0].astype(np.float32)
     looks = Looks(workpiece.vertices, workpiece.triangles)
-    search = BodySearch(scan, looks, lambda one: one.verdict.score > 0 and one.seen >= limits.seen)
+    # More of a part that is there is seen, though a third of it is covered. Less is seen of small
+    # areas, like a plate's edge, that fit many things.
+    least = 0.25
+    search = BodySearch(scan, looks, lambda one: one.verdict.score > 0 and one.seen >= least)
     found = [one for one in search.everywhere() if one.verdict.score > 0]
     fit = _laid(scan, looks, found[0].pose) if found else None
     if fit is None:
         raise CalibrationRefused(f"{STAGE}: the part is nowhere in the scan", _look(workpiece))
     best, seen = found[0].verdict.score, found[0].seen
-    if seen < limits.seen:
+    if seen < least:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: {seen:.0%} of the part's broadest side is in the scan, at least "
-            f"{limits.seen:.0%} is needed",
+            f"{least:.0%} is needed",
             _look(workpiece),
         )
     goes_on = found[0].verdict.goes_on / max(found[0].verdict.agree, 1)
     refuted = goes_on + search.refuted(fit.pose, lambda at: np.ones(len(at), dtype=bool))
-    _refuse_missing(workpiece, "the CAD's surface", refuted, limits)
-    if fit.noise > limits.residual:
+    _refuse_missing(workpiece, "the CAD's surface", refuted)
+    if fit.noise > max_residual:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: the scan is {fit.noise * 1e3:.3f} mm off the CAD, limit "
-            f"{limits.residual * 1e3:g} mm (max_residual)",
+            f"{max_residual * 1e3:g} mm (max_residual)",
             _look(workpiece),
         )
     reach = max(2 * (seam.half_width or 0.0), AROUND * looks.size)
     beside = search.refuted(fit.pose, lambda at: distances_to_line(at, seam.points) < reach)
-    _refuse_missing(workpiece, "the seam", beside, limits)
+    _refuse_missing(workpiece, "the seam", beside)
     second = 0.0
     # Candidates are sorted: the first one with another seam is the strongest rival.
     for other in found[1:]:
         apart = _seam_apart(seam, invert(fit.pose) @ other.pose, looks.size)
         if apart > SAME_SEAM:
             second = max(other.verdict.score / best, 0.0)
-            if second > 1 - limits.distinct:
+            if second > 0.97:  # the best pose is at least three percent better
                 _refuse_ambiguous(fit.pose, other.pose, apart, second)
             break
     return Registered(fit, seen, refuted, second)
@@ -159,13 +146,12 @@ def _seam_apart(seam: CadSeam, motion: Floats, size: float) -> float:
     return float(np.max(away))
 
 
-def _refuse_missing(
-    workpiece: Workpiece, what: str, share: float, limits: RegistrationLimits
-) -> None:
-    if share > limits.refuted:
+def _refuse_missing(workpiece: Workpiece, what: str, share: float) -> None:
+    allowed = 0.05  # of the surface in view
+    if share > allowed:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: the scanner sees through {share:.0%} of {what}, at most "
-            f"{limits.refuted:.0%} is allowed",
+            f"{allowed:.0%} is allowed",
             _look(workpiece),
         )
 

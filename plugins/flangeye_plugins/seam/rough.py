@@ -103,19 +103,17 @@ def _lines(q: Floats, normals: Floats, tolerance: float) -> Iterator[Line]:
 
 def _ends(face: Line, right: bool) -> list[Line]:
     """Return lines perpendicular to a face where its points end, with gaps of 0.5 mm or more."""
+    side = 1 if right else -1
     along = np.array([np.cos(face.angle), -np.sin(face.angle)])
     at = np.sort(face.on @ along)
     bins = np.arange(at[0], at[-1] + 1e-9, 0.25e-3)
-    counts = np.histogram(at, bins)[0] if len(bins) > 3 else np.ones(1)
-    full = np.concatenate([[False], counts > 0.3 * np.median(counts[counts > 0]), [False, False]])
-    if right:
+    edges = at[-1:] if right else -at[:1]
+    if len(bins) > 3:
+        counts = np.histogram(at, bins)[0][::side]
+        full = np.pad(counts > 0.3 * np.median(counts[counts > 0]), (1, 2))
         last = np.flatnonzero(full[:-2] & ~full[1:-1] & ~full[2:])
-        edges = bins[np.minimum(last, len(bins) - 1)] if len(bins) > 3 else at[-1:]
-        return [Line(face.angle + np.pi / 2, float(e), face.on[:0]) for e in edges]
-    full = np.concatenate([[False, False], counts > 0.3 * np.median(counts[counts > 0]), [False]])
-    first = np.flatnonzero(full[2:] & ~full[1:-1] & ~full[:-2])
-    edges = bins[np.minimum(first, len(bins) - 1)] if len(bins) > 3 else at[:1]
-    return [Line(face.angle - np.pi / 2, -float(e), face.on[:0]) for e in edges]
+        edges = (side * bins)[::side][last]
+    return [Line(face.angle + side * np.pi / 2, float(e), face.on[:0]) for e in edges]
 
 
 def _places(

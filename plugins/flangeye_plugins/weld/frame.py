@@ -8,7 +8,6 @@ upwards. Positions beside the seam agree to first order in their distance from i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -115,8 +114,6 @@ class WorkSurface:
         up = uniform_filter1d(rows_at(ticks, along, openings), width, 0, mode="nearest")
         self._rows: Floats = np.hstack([line, ahead, up])
         self._plain = self._rows.tolist()
-        planar = np.hstack([self.path.points[:, :2], self.path.tangents, self._rows])
-        self._both = planar.tolist()
 
     def line(self, s: Floats) -> tuple[Floats, Floats]:
         """Return points (K, 3) at arc lengths (K,), and axes (K, 3, 3) there, as columns.
@@ -213,37 +210,14 @@ class WorkSurface:
             points: Points in the plane [m]; on a closed seam the plane may overlap itself.
             near: (K,) approximate arc lengths of the points [m].
         """
-        pairs = zip(points.tolist(), near.tolist(), strict=True)
-        return np.array([self._unrolled(point, s) for point, s in pairs]).reshape(-1, 3)
+        each = [self._unrolled(*place) for place in zip(points, near.tolist(), strict=True)]
+        return np.array(each).reshape(-1, 3)
 
-    def _unrolled(self, point: list[float], s: float) -> list[float]:
-        px, py, pz = point
-        for _ in range(3):
-            x, y, tx, ty, *_ = self._beside(s)
-            s += (px - x) * tx + (py - y) * ty
-        x, y, tx, ty, beyond, *row = self._beside(s)
-        along, left = (px - x) * tx + (py - y) * ty, tx * (py - y) - ty * (px - x)
-        ahead = _unit(row[3:6])
-        across = _unit(_crossed(row[6:], ahead))
-        axes = zip(row[:3], ahead, across, _crossed(ahead, across), strict=True)
-        return [at + beyond * a + (a * along + up * pz + b * left) for at, a, b, up in axes]
-
-    def _beside(self, s: float) -> tuple[float, ...]:
-        """Return the seam at an arc length, in the plane and in base (14 numbers).
-
-        They are point and tangent in the plane, the distance beyond an end, and point, tangent and
-        opening in base.
-        """
-        path = self.path
-        inside = min(max(s, path.first), path.last)
-        tick = (inside - path.first) / path.step
-        index = min(int(tick), len(self._both) - 2)
-        share, kept = tick - index, 1.0 - (tick - index)
-        here, there = self._both[index], self._both[index + 1]
-        x, y, tx, ty, *row = (kept * a + share * b for a, b in zip(here, there, strict=True))
-        norm, beyond = math.sqrt(tx * tx + ty * ty), s - inside
-        tx, ty = tx / norm, ty / norm
-        return x + beyond * tx, y + beyond * ty, tx, ty, beyond, *row
+    def _unrolled(self, point: Floats, s: float) -> Floats:
+        for _ in range(2):
+            s = self.path.foot(point[:2], s)
+        stand = self.at(s)
+        return stand.point + stand.unrolled(point - [*stand.place.point, 0.0])
 
     def bending(self, distance: float) -> float:
         """Return the largest angle between the tool and the openings at its tip and torch [rad].
@@ -429,15 +403,5 @@ class Tool:
 
 def _cross(first: Floats, second: Floats) -> Floats:
     """Return the cross product of two vectors (3,); several times faster than NumPy's."""
-    return np.array(_crossed(first.tolist(), second.tolist()))
-
-
-def _crossed(first: Sequence[float], second: Sequence[float]) -> tuple[float, float, float]:
-    (a, b, c), (x, y, z) = first, second
-    return b * z - c * y, c * x - a * z, a * y - b * x
-
-
-def _unit(vector: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = vector
-    norm = math.sqrt(x * x + y * y + z * z)
-    return x / norm, y / norm, z / norm
+    (a, b, c), (x, y, z) = first.tolist(), second.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])

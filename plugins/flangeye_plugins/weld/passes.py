@@ -228,7 +228,7 @@ class MultiPassController:
         # Rotate with the path's curvature plus a correction of the heading; then, by (12), the end
         # point moves at V_r = V_t + L w n_d
         askew = math.remainder(place.heading - pose.angle, math.tau)
-        turning = GAIN * askew + settings.speed * self._bend()
+        turning = GAIN * askew + settings.speed * self._path.bend(self.torch)
         turn = within(turning, settings.turn_rate)
         planar = torch_speed + distance * turn * np.array([-ahead[1], ahead[0]])
         up = settings.height_gain * (place.height - float(pose.position[2]))
@@ -240,11 +240,6 @@ class MultiPassController:
         # What the arm carries out now was commanded one dead time ago.
         self.aim = self._pass.across + self._weave.at(elapsed - dead).aside
         return self._weave.at(elapsed).for_lag(self._response.lag)
-
-    def _bend(self) -> float:
-        """Return the path's curvature at the torch [1/m], to the left positive."""
-        before, after = (self._path.at(self.torch + s) for s in (-PATH_SPACING, PATH_SPACING))
-        return math.remainder(after.heading - before.heading, math.tau) / (2 * PATH_SPACING)
 
     def _estimate(self, error: float) -> None:
         """Update the torch's error bound, given its control error [m]; stop if it is too large."""

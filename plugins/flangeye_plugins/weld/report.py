@@ -168,15 +168,10 @@ def _loop(weld_log: WeldLog) -> Mapping[str, float]:
     """Return the loop's timing statistics, which differ between identical runs."""
     if not weld_log.cycles:
         return {}
-    computing = np.array([c.computing for c in weld_log.cycles])
-    answering = np.array([c.answering for c in weld_log.cycles])
-    period = np.array([c.period for c in weld_log.cycles[1:]] or [0.0])
-    return {
-        "cycles": float(len(computing)),
-        "computing_median": float(np.median(computing)),
-        "computing_p99": float(np.quantile(computing, 0.99)),
-        "answering_median": float(np.median(answering)),
-        "answering_p99": float(np.quantile(answering, 0.99)),
-        "period_median": float(np.median(period)),
-        "period_p99": float(np.quantile(period, 0.99)),
-    }
+    cycles = weld_log.cycles
+    figures = {"cycles": float(len(cycles))}
+    for name, counted in (("computing", cycles), ("answering", cycles), ("period", cycles[1:])):
+        times = [getattr(cycle, name) for cycle in counted] or [0.0]
+        figures[f"{name}_median"] = float(np.median(times))
+        figures[f"{name}_p99"] = float(np.quantile(times, 0.99))
+    return figures

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -33,22 +33,13 @@ RUN_IN = 2 * SETTLING
 """Run-in before the arc, in which the torch recovers from its displacement by the sweep [m]."""
 
 
-def controller_of(
-    plan: Path,
-    prior: ModelPrior,
-    settings: Following,
-    mode: Mode,
-    kept: ResumePoint | None = None,
-    start: WeldStart | None = None,
-) -> Controller:
-    """Return the controller for a mode; for the other arguments see :class:`WeldTask`."""
+def controller_of(task: WeldTask, mode: Mode) -> Controller:
+    """Return the controller that carries out a task in a mode."""
     if isinstance(mode, BoundPart):
-        controller: Controller = mode(task_of(plan, prior.distance, settings))
+        controller: Controller = mode(task_of(task.plan, task.prior.distance, task.settings))
         return controller
-    root = Follower(WeldTask(plan, prior, settings, mode == "tactile", kept, start))
-    if settings.passes and mode == "tactile":
-        return MultiPassController(root)
-    return root
+    root = Follower(replace(task, touch=mode == "tactile"))
+    return MultiPassController(root) if task.settings.passes and root.task.touch else root
 
 
 def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
@@ -87,7 +78,8 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
     before = None if kept is None else _kept_from(kept)
     given = start.get("start")
     at = None if given is None else WeldStart(**given)
-    return controller_of(plan, prior, settings, _mode_of(start["mode"]), before, at)
+    task = WeldTask(plan, prior, settings, before=before, given=at)
+    return controller_of(task, _mode_of(start["mode"]))
 
 
 def kept_value(kept: ResumePoint) -> dict[str, Any]:

@@ -26,8 +26,8 @@ from flangeye_plugins.weld.execution import Bounds, WeldCell, approach, follow, 
 from flangeye_plugins.weld.finger_camera import CameraJob, SteppedReader
 from flangeye_plugins.weld.following.bound import check_bound
 from flangeye_plugins.weld.following.follower import Follower
-from flangeye_plugins.weld.following.model_prior import ModelPrior, body_of, model_prior_of
-from flangeye_plugins.weld.following.task import ResumePoint, WeldStart
+from flangeye_plugins.weld.following.model_prior import body_of, model_prior_of
+from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.frame import LeaningTool, Tool, WorkSurface
 from flangeye_plugins.weld.passes import follower_of
 from flangeye_plugins.weld.path import Path
@@ -61,12 +61,13 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
     """
     allowed = limits.for_robot(model)
     planned = _planned(seam, driver, allowed, params)
-    params, driver, plan = planned.params, planned.driver, planned.plan
-    aside = planned.prior.set_down(params)
-    task = Task(model, allowed, planned.finger, planned.tool, plan, params, planned.start, aside)
-    passage = SeamReach(task)
+    task, params, driver = planned.task, planned.params, planned.driver
+    plan, aside = task.plan, task.prior.set_down(params)
+    passage = SeamReach(
+        Task(model, allowed, planned.finger, planned.tool, plan, params, task.start, aside)
+    )
     checks.check_controller(params.mode, driver)
-    controller_of(plan, planned.prior, params, params.mode, planned.kept, planned.start)
+    controller_of(task, params.mode)
     if not (motion.allowed or driver.simulated):
         raise NothingMoved(_plan_text(plan, params))
     with ExitStack() as opened:
@@ -74,10 +75,10 @@ def weld_tactile(  # noqa: PLR0913  one for each thing a weld needs
         job = CameraJob(params.sensor, planned.finger, robot.state(), seed, params.profiler)
         eyes: FingerCameraReader = SteppedReader(job) if driver.simulated else CameraProcess(job)
         opened.enter_context(eyes)
-        prior = replace(planned.prior, behind=eyes.behind)
-        controller = controller_of(plan, prior, params, params.mode, planned.kept, planned.start)
+        task = replace(task, prior=replace(task.prior, behind=eyes.behind))
+        controller = controller_of(task, params.mode)
         weld_log = opened.enter_context(WeldLog(stage_log, not driver.simulated))
-        weld_log.note("start", start_of(planned, prior))
+        weld_log.note("start", start_of(planned, task))
         cell = WeldCell(
             Executor(robot, model, allowed, eyes.tell), eyes, planned.tool,
             Bounds(planned.finger, plan),
@@ -105,30 +106,24 @@ class PlannedWeld:
     Attributes:
         seam: The seam, or its leg, that is welded.
         surface: Work surface along the seam.
-        plan: The seam in the plane.
         finger: The finger on the arm.
         body: Tool in its orientation along the seam.
         tool: Converts between the flange's pose in base and the tool's pose in the plane.
-        prior: Prior knowledge of tool, finger and joint.
+        task: The seam in the plane, with prior and start.
         params: Parameters of the step.
-        start: Start of the weld on its plan.
         driver: Driver of the arm, with the power source if there is one.
         gas_after: Post-flow time of the gas [s]; None without a power source.
-        kept: State of the weld that is resumed; None for a new one.
     """
 
     seam: Seam
     surface: WorkSurface
-    plan: Path
     finger: Finger
     body: LeaningTool
     tool: Tool
-    prior: ModelPrior
+    task: WeldTask
     params: WeldTactileParams
-    start: WeldStart
     driver: RobotDriver
     gas_after: float | None
-    kept: ResumePoint | None
 
 
 def _planned(
@@ -149,18 +144,16 @@ def _planned(
     checks.check_seam(seam, surface, body.distance, params)
     checks.check_speeds(finger, params, allowed)
     kept = None if params.resume is None else resume_point_of(params.resume, surface.points)
-    start = WeldStart(params.set_down)
-    if kept is not None:
-        start = restart(params, plan, body.distance, kept)
+    start = None if kept is None else restart(params, plan, body.distance, kept)
     driver, times = _with_power_source(driver, params)
     if times is not None:
         prior = replace(prior, arc=(times.gas_before, times.ignition, times.crater))
     checks.check_tool(body, prior, params)
     check_bound(plan, prior, params)
-    return PlannedWeld(
-        seam, surface, plan, finger, body, Tool(finger, surface, body), prior, params, start,
-        driver, None if times is None else times.gas_after, kept,
-    )  # fmt: skip
+    task = WeldTask(plan, prior, params, before=kept, given=start)
+    gas_after = None if times is None else times.gas_after
+    tool = Tool(finger, surface, body)
+    return PlannedWeld(seam, surface, finger, body, tool, task, params, driver, gas_after)
 
 
 def _kept(planned: PlannedWeld, follower: Follower | None) -> tuple[Note, ...]:
@@ -203,16 +196,16 @@ def _plan_text(plan: Path, params: WeldTactileParams) -> str:
     )
 
 
-def start_of(planned: PlannedWeld, prior: ModelPrior) -> dict[str, Any]:
+def start_of(planned: PlannedWeld, task: WeldTask) -> dict[str, Any]:
     """Return all inputs of the controller other than measurements, for the log."""
-    params, kept = planned.params, planned.kept
+    params, kept = planned.params, task.before
     return {
         "points": planned.surface.points.tolist(),
-        "wraps": -planned.plan.first,
+        "wraps": -task.plan.first,
         "finger": planned.finger.model_dump(mode="json"),
-        "prior": asdict(prior),
+        "prior": asdict(task.prior),
         "mode": params.model_dump(mode="json", include={"mode"})["mode"],
         "kept": None if kept is None else kept_value(kept),
-        "start": asdict(planned.start),
+        "start": asdict(task.start),
         "settings": params.model_dump(mode="json", include=set(Following.model_fields)),
     }

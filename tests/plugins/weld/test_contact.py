@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from flangeye_plugins.weld.following.contact import Contact, ContactMeasurement, Mode
+from flangeye_plugins.weld.following.contact import Contact, Mode, SeamReading, TipPosition
 
 NOISE = (20e-6, 120e-6)
 FLAT = math.tan(math.radians(40.0))
@@ -29,11 +29,10 @@ class Tip:
         for _ in range(times):
             self.k += 1
             across, high = self.rng.standard_normal(2) * self.found.noise
-            self.found.take(
-                ContactMeasurement(self.k / 30, self.k * 0.2e-3, 5e-3, 0.1, aside + across,
-                     self.spread**2 + self.found.noise[0] ** 2, up + high,
-                     deflection + across, compression), side,
-            )  # fmt: skip
+            seam, place = SeamReading(5e-3, up + high), self.k * 0.2e-3
+            felt = TipPosition(self.k / 30, place, seam, deflection + across, compression, 0.1)
+            spread = self.spread**2 + self.found.noise[0] ** 2
+            self.found.take(felt, aside + across, spread, side)
         return self.found.likely
 
 

@@ -13,15 +13,15 @@ from flangeye.errors import StageError
 from flangeye.types import Seam
 from flangeye_emulators.weld_world.groove import Tip
 from flangeye_emulators.weld_world.truth import WeldTruth
-from flangeye_emulators.weld_world.world import Nominal
 from flangeye_plugins.weld.checks import check_seam
 from flangeye_plugins.weld.corners import corners_of, leg_of
+from flangeye_plugins.weld.following.follower import Follower
+from flangeye_plugins.weld.following.task import WeldTask
 from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.resuming import controller_of
 from flangeye_plugins.weld.settings import Following, WeldTactileParams
 from tests.plugins.weld import bench, cell
-from tools.weld_bench import built_for, known, start_at
+from tools.weld_bench import set_up, start_at
 from tools.weld_conditions import LAP, Condition
 from tools.weld_trial import run_trial
 
@@ -135,18 +135,18 @@ def test_tip_and_torch_go_round_a_corner_of_a_groove(turn: float) -> None:
 
 def round_a_corner(turn, joint, shift, plan_turn=0.01, **given):
     """Weld round a corner in a world of its own, the plan shifted [m]."""
-    asked = Following.model_validate({"joint": joint, "max_error": "1.5 mm", **given})
+    settings = {"joint": joint, "max_error": "1.5 mm", **given}
+    condition = Condition(settings=settings, section=JOINTS[joint])
     true = dense(polyline(turn, leg=0.06))
     misplanned = seam_of(bench.misplaced(true, shift, plan_turn))
     leg = leg_of(misplanned, told(**{**ROUND, "joint": joint}))
-    surface = WorkSurface(leg.points_in_base, leg.openings_in_base)
     plan = Path(leg.points_in_base)
-    body = built_for(asked)
-    section, prior = known(Condition(section=JOINTS[joint]), body, asked)
-    check_seam(misplanned, surface, prior.distance, asked)
-    seam = Nominal(Path(true), section, Tip(), body.level_R_tool.T @ body.torch, body.level_R_tool)
-    controller = controller_of(plan, prior, asked, "tactile")
-    return run_trial(controller, seam, WeldTruth(), start_at(plan, prior, asked, 16e-3), 0)
+    _, prior, nominal = set_up(condition, true)
+    surface = WorkSurface(leg.points_in_base, leg.openings_in_base)
+    check_seam(misplanned, surface, prior.distance, condition.asked)
+    controller = Follower(WeldTask(plan, prior, condition.asked))
+    start = start_at(plan, prior, condition.asked, 16e-3)
+    return run_trial(controller, nominal, WeldTruth(), start, 0)
 
 
 JOINTS = {"lap": LAP, "groove": None}

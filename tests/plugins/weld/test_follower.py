@@ -14,9 +14,9 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, ToolPose, Touch
 from flangeye_plugins.weld.following.bound import along
+from flangeye_plugins.weld.following.contact import SeamReading, TipPosition
 from flangeye_plugins.weld.following.follower import Follower
 from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
-from flangeye_plugins.weld.following.sensing import SeamReading, TipPosition
 from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
@@ -320,7 +320,7 @@ def test_a_seam_that_has_moved_by_two_tenths_since_the_stop_is_another_one(
     found = make(before=ResumePoint(samples, 0.03)).seam
 
     def compared(at: float, offset: float) -> str:
-        return str(found.moved(TipPosition(at, SeamReading(offset, 0.0), 0.0, 0.0, 0.0)))
+        return str(found.moved(TipPosition(0.0, at, SeamReading(offset, 0.0), 0.0, 0.0, 0.0)))
 
     for i in range(14):
         assert not compared(0.02 + 1e-4 * i, 1e-3 + moved + (5e-3 if i % 3 == 0 else 0.0))

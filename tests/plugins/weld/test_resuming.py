@@ -156,5 +156,5 @@ def test_later_passes_follow_a_weld_by_touch_alone() -> None:
         ("tactile", settings, MultiPassController), ("vision", settings, Follower), ("tactile", alone, Follower),
     ):  # fmt: skip
         given: Mode = mode
-        controller = controller_of(plan, ModelPrior(DISTANCE), asked, given)
+        controller = controller_of(WeldTask(plan, ModelPrior(DISTANCE), asked), given)
         assert type(controller) is kind and controller.mode == mode

@@ -196,19 +196,22 @@ def _label(start: float, end: float, phase: str) -> dict[str, Any]:
 
 def _loop(weld: WeldReport) -> list[tuple[str, str]]:
     """Return the loop's figures as text."""
-    loop = weld.loop
     rows = [
-        ("cycles", f"{loop.get('cycles', 0):.0f}"),
-        ("computing, median", f"{loop.get('computing_median', 0) * 1e3:.2f} ms"),
-        ("computing, 99 % below", f"{loop.get('computing_p99', 0) * 1e3:.2f} ms"),
-        ("cycle start to command sent, median", f"{loop.get('answering_median', 0) * 1e3:.2f} ms"),
-        ("cycle start to command sent, 99 % below", f"{loop.get('answering_p99', 0) * 1e3:.2f} ms"),
-        ("period, median", f"{loop.get('period_median', 0) * 1e3:.2f} ms"),
-        ("period, 99 % below", f"{loop.get('period_p99', 0) * 1e3:.2f} ms"),
         ("images read", f"{weld.figures.get('images', 0):.0f}"),
         ("with the tag", f"{weld.figures.get('images_with_tag', 0):.0f}"),
     ]
-    return rows if loop else rows[-2:]
+    if not weld.loop:
+        return rows
+    times = [
+        (f"{words}, {share}", f"{weld.loop.get(f'{name}_{key}', 0) * 1e3:.2f} ms")
+        for name, words in (
+            ("computing", "computing"),
+            ("answering", "cycle start to command sent"),
+            ("period", "period"),
+        )
+        for key, share in (("median", "median"), ("p99", "99 % below"))
+    ]
+    return [("cycles", f"{weld.loop.get('cycles', 0):.0f}"), *times, *rows]
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -52,30 +53,37 @@ RARE = 1e-3
 """Probability, per STRIDE, that a lightly pressed tip climbs."""
 
 
-class ContactMeasurement(NamedTuple):
-    """A measurement, compared with the one expected of a seated tip [m].
+@dataclass(frozen=True, eq=False)
+class SeamReading:
+    """The seam at the tip: measured in contact, otherwise predicted.
 
     Attributes:
-        time: Time [s].
-        s: Arc length.
-        offset: Offset to the left of the plan.
+        offset: Offset to the left of the plan [m].
+        height: Height above the plan [m].
+    """
+
+    offset: float
+    height: float
+
+
+class TipPosition(NamedTuple):
+    """Position of the tip at one measurement.
+
+    Attributes:
+        time: Time of the measurement [s].
+        s: Arc length on the plan [m].
+        seam: The seam there, if the tip is seated.
+        deflection: Deflection of the tip, towards the pressed wall [m].
+        compression: Compression of the tip, into the joint [m].
         angle: Angle of the tool [rad].
-        aside: Offset to the left of the expected seam.
-        spread: Variance of ``aside``: measurement and expectation [m^2].
-        height: Height above the plan.
-        deflection: Towards the pressed side.
-        compression: Compression into the joint.
     """
 
     time: float
     s: float
-    offset: float
-    angle: float
-    aside: float
-    spread: float
-    height: float
+    seam: SeamReading
     deflection: float
     compression: float
+    angle: float
 
 
 class _WeighedMeasurement(NamedTuple):
@@ -89,7 +97,7 @@ class _WeighedMeasurement(NamedTuple):
         climbed: Height that the tip has risen, if it has climbed [m].
     """
 
-    felt: ContactMeasurement
+    felt: TipPosition
     likely: Floats
     moves: Floats
     chances: Floats
@@ -163,33 +171,40 @@ class Contact:
         stands = self.steady * max(self.compression, 1e-9)
         return abs(self.deflection) / stands
 
-    def take(self, felt: ContactMeasurement, side: float) -> None:
-        """Update the modes' probabilities by a measurement; ``side`` is the pressed wall."""
+    def take(self, felt: TipPosition, aside: float, spread: float, side: float) -> None:
+        """Update the modes' probabilities by a measurement.
+
+        Args:
+            felt: The measurement.
+            aside: Its offset to the left of the expected seam [m].
+            spread: Variance of ``aside``: measurement and expectation [m^2].
+            side: Side of the pressed wall: 1 left, -1 right.
+        """
         # Deflection and compression are filtered over 0.1 s.
         kept = math.exp(-(felt.time - self._time) / 0.1)
         self.deflection += (1.0 - kept) * (felt.deflection - self.deflection)
         self.compression += (1.0 - kept) * (felt.compression - self.compression)
         way, self._time, self.at = abs(felt.s - self.at), felt.time, felt.s
         if self._spread == math.inf:
-            way, self._height, self._spread = 0.0, felt.height, self.noise[1] ** 2
+            way, self._height, self._spread = 0.0, felt.seam.height, self.noise[1] ** 2
         # A tip that is pressed aside by more than it stands climbs within 1 mm.
         share, soon = (1.0 - math.exp(-(way + 1e-4) / over) for over in (STRIDE, 1e-3))
         self._spread += share * LIFTS**2 / 100.0
         moves = self._moves(share, soon)
-        chances, climbed = self._chances(felt, side)
+        chances, climbed = self._chances(felt, side * aside, spread)
         weighed = (self.likely @ moves) * chances
         self.likely = weighed / weighed.sum()
         self._newest.append(_WeighedMeasurement(felt, self.likely, moves, chances, climbed))
         # Only a seated tip measures the height of the seam
         gain = float(self.likely[Mode.SEATED]) * self._spread / (self._spread + self.noise[1] ** 2)
-        self._height += gain * (felt.height - self._height)
+        self._height += gain * (felt.seam.height - self._height)
         self._spread *= 1.0 - gain
 
     def forget(self) -> None:
         """Drop the measurements not yet used, which were made while no wall held the tip."""
         self._newest.clear()
 
-    def settled(self, until: float) -> Iterator[tuple[ContactMeasurement, float]]:
+    def settled(self, until: float) -> Iterator[tuple[TipPosition, float]]:
         """Yield valid measurements up to a time [s], each with its extra variance [m^2]."""
         # Backward pass: `since` is the likelihood of all later measurements, given each mode
         since, off = np.ones(len(Mode)), []
@@ -231,14 +246,15 @@ class Contact:
         moves[Mode.SEATED, Mode.SEATED] -= climbing + 2.0 * share * RARE * 10.0
         return moves
 
-    def _chances(self, felt: ContactMeasurement, side: float) -> tuple[Floats, float]:
-        """Return a measurement's likelihood in each mode (5,), and the height climbed [m]."""
-        up, tall = felt.height - self._height, self._spread + self.noise[1] ** 2
+    def _chances(self, felt: TipPosition, aside: float, spread: float) -> tuple[Floats, float]:
+        """Return a measurement's likelihood in each mode (5,), and the height climbed [m].
+
+        ``aside`` is its offset from the expected seam towards the pressed side [m].
+        """
+        up, tall = felt.seam.height - self._height, self._spread + self.noise[1] ** 2
         # Tack welds lift the tip on 10 % of a seam; 2 % of a seam bend in a way not planned.
-        seated = _mostly(up, tall, 0.1) * _mostly(felt.aside, felt.spread, 0.02)
-        walls = [
-            _up_a_wall(s * side * felt.aside, up, felt.spread, tall, self._flat) for s in (1, -1)
-        ]
+        seated = _mostly(up, tall, 0.1) * _mostly(aside, spread, 0.02)
+        walls = [_up_a_wall(s * aside, up, spread, tall, self._flat) for s in (1, -1)]
         free = self._let_go(felt.deflection) * _normal(up, tall + LIFTS**2)
         climbed = walls[0][1] if felt.deflection > 0.0 else walls[1][1]
         borne, hangs = self._compressed(felt.compression)

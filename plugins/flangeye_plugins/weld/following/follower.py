@@ -12,10 +12,15 @@ from flangeye.devices import WeldProfile
 from flangeye.motion.arc import OFF
 from flangeye.motion.seam_following import STILL, Command, Phase, ToolPose, Touch
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.contact import LOSS_PROBABILITY, STRAINED, STRIDE
+from flangeye_plugins.weld.following.contact import (
+    LOSS_PROBABILITY,
+    STRAINED,
+    STRIDE,
+    SeamReading,
+)
 from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.response import Response
-from flangeye_plugins.weld.following.sensing import SeamEstimate, SeamReading, Sensing
+from flangeye_plugins.weld.following.sensing import SeamEstimate, Sensing
 from flangeye_plugins.weld.following.steering import SLOWEST, TorchLead
 from flangeye_plugins.weld.following.task import ResumePoint, WeldTask
 from flangeye_plugins.weld.following.tip import DeflectionTarget, SeamProgress, within
@@ -169,7 +174,7 @@ class Follower:
         elif self.phase == "probing":
             sensing.sweep(*taken, found, self.seam.refined.noise)
         else:
-            self.seam.weigh(touch.time, found, sensing.learned, self.side)
+            self.seam.weigh(found, sensing.learned, self.side)
             if self.phase in ("bridging", "entering"):
                 self.seam.contact.forget()
             elif self.seam.contact.free < 0.5:

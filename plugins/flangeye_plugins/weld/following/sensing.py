@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import deque
-from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
 
 import numpy as np
 
 from flangeye.motion.seam_following import Phase, ToolPose, Touch, turned
 from flangeye.types import Floats
-from flangeye_plugins.weld.following.contact import LOSS_PROBABILITY, Contact, ContactMeasurement
+from flangeye_plugins.weld.following.contact import (
+    LOSS_PROBABILITY,
+    Contact,
+    SeamReading,
+    TipPosition,
+)
 from flangeye_plugins.weld.following.model_prior import SweepFit
 from flangeye_plugins.weld.following.probing import SOFTER, SWEEP_MARGIN, Probing
 from flangeye_plugins.weld.following.refined import RefinedPath, Sample
@@ -24,37 +27,6 @@ from flangeye_plugins.weld.settings import INSIDE
 
 STEADY = 0.03e-3
 """Below this noise a touch is used without averaging [m]."""
-
-
-@dataclass(frozen=True, eq=False)
-class SeamReading:
-    """The seam at the tip: measured in contact, otherwise predicted.
-
-    Attributes:
-        offset: Offset to the left of the plan [m].
-        height: Height above the plan [m].
-    """
-
-    offset: float
-    height: float
-
-
-class TipPosition(NamedTuple):
-    """Position of the tip at one measurement.
-
-    Attributes:
-        s: Arc length on the plan [m].
-        seam: The seam there, if the tip is seated.
-        deflection: Deflection of the tip, towards the pressed wall [m].
-        compression: Compression of the tip, into the joint [m].
-        angle: Angle of the tool [rad].
-    """
-
-    s: float
-    seam: SeamReading
-    deflection: float
-    compression: float
-    angle: float
 
 
 class Sensing:
@@ -119,7 +91,7 @@ class Sensing:
         beside = float((tip[:2] - place.point) @ place.normal) - prior.beside
         felt = SeamReading(beside, float(tip[2]) - place.height)
         deflection = self._pressing.side * float((pose.position - tip)[:2] @ place.normal)
-        return TipPosition(s, felt, deflection, float(corrected[2]), pose.angle)
+        return TipPosition(touch.time, s, felt, deflection, float(corrected[2]), pose.angle)
 
     def _corrected(self, displacement: Floats, phase: Phase) -> Floats:
         """Return a displacement (3,) corrected for the finger's rest, gain and play [m]."""
@@ -293,27 +265,17 @@ class SeamEstimate:
         """Mean height above the plan of the last accepted, seated touches [m]."""
         return float(np.mean(self._heights or [0.0]))
 
-    def weigh(self, time: float, found: TipPosition, learned: SweepFit, side: float) -> None:
-        """Update the contact modes by a touch.
-
-        Args:
-            time: Time of the touch [s].
-            found: Position of the tip at the touch.
-            learned: Calibration from the sweep.
-            side: Side of the pressed wall: 1 left, -1 right.
-        """
-        s, seam = found.s, found.seam
-        offset, variance = self.refined.expected(s)
-        aside = seam.offset - offset
+    def weigh(self, found: TipPosition, learned: SweepFit, side: float) -> None:
+        """Update the contact modes by a touch, while the wall on this side is pressed."""
+        offset, variance = self.refined.expected(found.s)
         # Play is left out of the variance: it displaces the path's earlier touches by the same.
         spread = variance + (learned.noise / (1.0 + learned.gain)) ** 2 + STEADY**2
-        expected = time, s, seam.offset, found.angle, aside, spread, seam.height
-        self.contact.take(ContactMeasurement(*expected, found.deflection, found.compression), side)
+        self.contact.take(found, found.seam.offset - offset, spread, side)
         if self.contact.free <= LOSS_PROBABILITY:
             self.lost = None
         elif self.lost is None:
-            self.lost = time
-        if self._task.plan.closed and s >= self._task.plan.length:
+            self.lost = found.time
+        if self._task.plan.closed and found.s >= self._task.plan.length:
             self._go_around()
 
     def _go_around(self) -> None:
@@ -336,8 +298,8 @@ class SeamEstimate:
         if task.feels_ends and task.prior.two_walls:
             end = task.plan.length + task.beyond
         for felt, doubt in self.contact.settled(until):
-            sample = felt.s, felt.offset, felt.angle, doubt
-            self._heights.append(felt.height)
+            sample = felt.s, felt.seam.offset, felt.angle, doubt
+            self._heights.append(felt.seam.height)
             if self._backed is not None:
                 self._backed.append(sample)
             elif felt.s < end:
