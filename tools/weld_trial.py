@@ -79,6 +79,11 @@ class Trial:
         return np.asarray(np.abs(self.column("torch") - self.column("aim"))[self.beside])
 
     @property
+    def bounded(self) -> bool:
+        """Whether every one of them was within the controller's bound."""
+        return bool((self.errors <= self.column("bound")[self.beside]).all())
+
+    @property
     def share_welded(self) -> float:
         """Share of the true seam on which the torch welded within its bound, ends included.
 

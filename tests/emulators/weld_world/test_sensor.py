@@ -12,7 +12,6 @@ import pytest
 from flangeye.files.paths import bundled
 from flangeye.maths.seam_geometry import torch_deviation
 from flangeye.models.finger import Finger
-from flangeye.models.model import read_model
 from flangeye.motion.seam_following import ToolPose
 from flangeye.types import Seed
 from flangeye_emulators.finger.sensor import (
@@ -22,9 +21,7 @@ from flangeye_emulators.finger.sensor import (
 )
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_emulators.weld_world.truth import HeatTruth, WeldTruth, WorkpieceTruth
-from tests.plugins.weld.cell import HOME, MODEL, planned, run, true_line
-
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
+from tests.plugins.weld.cell import FINGER, HOME, MODEL, planned, run, true_line
 
 
 class Growing(list[Any]):

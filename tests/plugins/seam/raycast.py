@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 MM = 1e-3
 LENGTH, WIDE = 0.12, 0.06
@@ -112,12 +113,7 @@ def scan_of(joint, seed, pitch=0.35 * MM, noise=0.08 * MM, faults=True, plates=N
     pose = _pose(rng, TURNS.get(joint, 0.0), distance, tilt)
     clutter = _clutter(rng) if faults else []
     bodies = [plate.moved(pose) for plate in [*plates, *clutter]]
-    half = 0.1 / distance
-    ticks = np.arange(-half, half, pitch / distance)
-    shape = len(ticks), len(ticks)
-    x, y = np.meshgrid(ticks, ticks)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays, shape = _rays(0.1 / distance, pitch / distance)
     depth, normals = _first(bodies, np.zeros(3), rays)
     # The bench lies behind the part.
     depth = np.minimum(depth, (distance + 0.12) / rays[:, 2])
@@ -131,14 +127,19 @@ def scan_of(joint, seed, pitch=0.35 * MM, noise=0.08 * MM, faults=True, plates=N
 
 def seen_by(bodies, pitch, half=0.12, noise=0.08 * MM, seed=0):
     """Return what a camera at the origin sees of bodies, without faults; pitch and half of a ray."""
-    ticks = np.arange(-half, half, pitch)
-    x, y = np.meshgrid(ticks, ticks)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays, _ = _rays(half, pitch)
     depth = _first(bodies, np.zeros(3), rays)[0]
     depth = depth + noise * np.random.default_rng(seed).normal(size=len(depth))
     kept = np.isfinite(depth)
     return depth[kept, None] * rays[kept]
+
+
+def _rays(half, pitch):
+    """Return unit rays (N, 3) through a square image, and the image's shape."""
+    ticks = np.arange(-half, half, pitch)
+    x, y = np.meshgrid(ticks, ticks)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True), x.shape
 
 
 JOINTS = ("vee", "bevel", "butt", "lap", "fillet", "corner")
@@ -146,21 +147,11 @@ JOINTS = ("vee", "bevel", "butt", "lap", "fillet", "corner")
 
 def _pose(rng, turn, distance, tilt):
     """Return camera_T_joint: z towards the camera but for ``turn`` about x and a random tilt."""
-
-    def about(axis, angle):
-        c, s = np.cos(angle), np.sin(angle)
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        out = np.eye(3)
-        out[i, i] = out[j, j] = c
-        out[i, j], out[j, i] = -s, s
-        return out
-
-    upright = np.diag([1.0, -1.0, -1.0])
-    lean = about(0, np.radians(rng.uniform(-tilt, tilt))) @ about(
-        1, np.radians(rng.uniform(-tilt, tilt))
-    )
+    upright = Rotation.from_euler("x", np.pi)
+    lean = Rotation.from_euler("XYX", [*rng.uniform(-tilt, tilt, 2), turn], degrees=True)
+    spin = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))
     pose = np.eye(4)
-    pose[:3, :3] = about(2, rng.uniform(0, 2 * np.pi)) @ upright @ lean @ about(0, np.radians(turn))
+    pose[:3, :3] = (spin * upright * lean).as_matrix()
     pose[:3, 3] = [rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), distance]
     return pose
 

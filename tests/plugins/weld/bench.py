@@ -1,7 +1,12 @@
 """The controller against the simulated groove, without images and without an arm."""
 
-import numpy as np
+from contextlib import nullcontext
 
+import numpy as np
+import pytest
+
+from flangeye.errors import StageError
+from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.weld_world.groove import GrooveSection, Tip
 from flangeye_emulators.weld_world.truth import ClockTruth, FingerTruth, WeldTruth, WorkpieceTruth
 from flangeye_emulators.weld_world.world import Nominal
@@ -16,6 +21,30 @@ from tools.weld_trial import Start, run_trial
 DISTANCE = weld_bench.DISTANCE
 SECTION = GrooveSection(np.pi / 6, 8e-3)
 PERIOD = 16e-3
+
+
+def following(**given):
+    return Following.model_validate(given)
+
+
+def pose(x=0.0, y=0.0, z=0.0, angle=0.0, time=0.0):
+    return ToolPose(time, np.array([x, y, z]), angle)
+
+
+def refused(message):
+    """Where nothing is wrong the message is None."""
+    return nullcontext() if message is None else pytest.raises(StageError, match=message)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def circle(radius, end=2.5, count=600):
+    """Points of a circle through an angle [rad]; a negative radius is to the right [m]."""
+    turn = np.linspace(0.0, end, count)
+    x, y = abs(radius) * np.sin(turn), radius * (1 - np.cos(turn))
+    return np.column_stack([x, y, 0 * turn])
 
 
 def straight(length=0.12):

@@ -10,10 +10,11 @@ from flangeye.devices import MotionAllowed, RobotDriver, StateSource, TactileSen
 from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model
+from flangeye.models.model import read_model
 from flangeye.models.workpiece import load_workpiece
 from flangeye.plugin.stage import BoundPart, part
 from flangeye.types import Seam, Seed
-from flangeye.types.geometry import rigid, rotation_from_rpy
+from flangeye.types.geometry import arc_lengths, rigid, rotation_from_rpy, rows_at
 from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.finger.sensor import (
     SimulatedFinger,
@@ -31,15 +32,15 @@ HERE = rigid(rotation_from_rpy(0, 0, np.deg2rad(20)), np.array([0.6, 0.0, 0.25])
 HOME = ("180 deg", "-90 deg", "90 deg", "-90 deg", "-90 deg", "0 deg")
 BOX = {"centre": ["400 mm", "0 mm", "450 mm"], "size": ["1200 mm", "1200 mm", "900 mm"]}
 MODEL = load_model("robots", "ur10e")
+FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 
 
 def true_line(name, end=None):
     """The true seam (N, 3) in base, every 2 mm, up to an arc length [m]."""
     points = load_workpiece(bundled("data") / "workpieces" / f"{name}.yaml").seams["groove"].points
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = arc_lengths(points)
     ticks = np.arange(0.0, end or along[-1], 1e-3)
-    dense = np.stack([np.interp(ticks, along, axis) for axis in points.T], axis=1)
-    return dense @ HERE[:3, :3].T + HERE[:3, 3]
+    return rows_at(ticks, along, points) @ HERE[:3, :3].T + HERE[:3, 3]
 
 
 def planned(name, shift=(0.0, 0.0, 0.0), turn=0.0, end=None, uncertainty=1e-4):

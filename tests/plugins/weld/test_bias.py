@@ -8,6 +8,11 @@ from flangeye_plugins.weld.following.bias import CONTRADICTIONS, Bias, Trail
 PRIOR, HEAT, LENGTH, SIGMA = 0.3e-3**2, 0.1e-3, 40e-3, 0.05e-3
 
 
+@pytest.fixture
+def bias() -> Bias:
+    return Bias(PRIOR, HEAT, LENGTH)
+
+
 def looked(bias, truth, count=100, step=0.5e-3, seed=0, sigma=SIGMA):
     rng = np.random.default_rng(seed)
     for i in range(count):
@@ -15,15 +20,13 @@ def looked(bias, truth, count=100, step=0.5e-3, seed=0, sigma=SIGMA):
     return (count - 1) * step
 
 
-def test_without_a_look_the_files_are_believed() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_without_a_look_the_files_are_believed(bias: Bias) -> None:
     assert not bias.looked
     assert bias.value == 0.0
     assert bias.variance(0.0) == bias.variance(1.0) == PRIOR
 
 
-def test_one_look_counts_as_its_sigma_says() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_one_look_counts_as_its_sigma_says(bias: Bias) -> None:
     bias.look(0.01, 0.4e-3, SIGMA, 0.12e-3**2)
     noise = SIGMA**2 + 0.12e-3**2
     gain = PRIOR / (PRIOR + noise)
@@ -32,8 +35,7 @@ def test_one_look_counts_as_its_sigma_says() -> None:
 
 
 @pytest.mark.parametrize("truth", [0.5e-3, -0.8e-3, 0.0])
-def test_it_comes_to_the_truth(truth: float) -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_it_comes_to_the_truth(bias: Bias, truth: float) -> None:
     last = looked(bias, truth)
     assert bias.value == pytest.approx(truth, abs=0.04e-3)
     assert SIGMA**2 < bias.variance(last) < PRIOR / 10
@@ -49,8 +51,7 @@ def test_many_looks_on_one_spot_are_no_better_than_one() -> None:
     assert once.variance(LENGTH) < 0.8 * often.variance(0.0)
 
 
-def test_a_place_that_was_looked_at_says_nothing_new() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_a_place_that_was_looked_at_says_nothing_new(bias: Bias) -> None:
     last = looked(bias, 0.3e-3)
     before = bias.value, bias.variance(last)
     bias.look(last, -0.3e-3, SIGMA, 0.0)
@@ -58,25 +59,23 @@ def test_a_place_that_was_looked_at_says_nothing_new() -> None:
     assert (bias.value, bias.variance(last)) == before
 
 
-def test_the_torch_is_ahead_of_what_was_looked_at() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_the_torch_is_ahead_of_what_was_looked_at(bias: Bias) -> None:
     last = looked(bias, 0.3e-3)
     ahead = bias.variance(last + LENGTH) - bias.variance(last)
     assert ahead == pytest.approx(HEAT**2)
     assert bias.variance(last + 100.0) == pytest.approx(PRIOR + bias.value**2)
 
 
-def test_where_there_was_no_look_for_long_the_next_one_counts_as_the_first_did() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_where_there_was_no_look_for_long_the_next_one_counts_as_the_first_did(bias: Bias) -> None:
     looked(bias, 0.0, sigma=1e-9)
     bias.look(1000.0, 0.4e-3, SIGMA, 0.0)
     assert bias.value == pytest.approx(PRIOR / (PRIOR + SIGMA**2) * 0.4e-3, rel=1e-3)
 
 
-def test_it_follows_a_bias_that_changes_as_it_is_stated_to() -> None:
+def test_it_follows_a_bias_that_changes_as_it_is_stated_to(bias: Bias) -> None:
     rng = np.random.default_rng(3)
     step, off = 0.5e-3, []
-    bias, truth = Bias(PRIOR, HEAT, LENGTH), 0.0
+    truth = 0.0
     for i in range(2000):
         truth += HEAT * np.sqrt(step / LENGTH) * rng.standard_normal()
         bias.look(i * step, truth + SIGMA * rng.standard_normal(), SIGMA, 0.0)
@@ -85,8 +84,7 @@ def test_it_follows_a_bias_that_changes_as_it_is_stated_to() -> None:
     assert np.abs(off).max() < 4.0
 
 
-def test_spatter_is_passed_over() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_spatter_is_passed_over(bias: Bias) -> None:
     last = looked(bias, 0.1e-3)
     before = bias.value
     for i in range(1, CONTRADICTIONS):
@@ -98,8 +96,7 @@ def test_spatter_is_passed_over() -> None:
     assert not bias.doubt
 
 
-def test_looks_that_all_contradict_the_files_are_told() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_looks_that_all_contradict_the_files_are_told(bias: Bias) -> None:
     looked(bias, 2e-3, CONTRADICTIONS, sigma=1e-6)
     assert bias.value == 0.0
     assert "sees the bead +2.00 mm" in bias.doubt
@@ -129,8 +126,7 @@ def test_a_trail_tells_where_the_torch_was_and_how_far_aside() -> None:
     assert trail.passing(4.4e-3) == (4e-5, 4e-9)
 
 
-def test_what_a_look_contradicts_is_told_with_what_was_known_before() -> None:
-    bias = Bias(PRIOR, HEAT, LENGTH)
+def test_what_a_look_contradicts_is_told_with_what_was_known_before(bias: Bias) -> None:
     last = looked(bias, 0.4e-3)
     for i in range(1, 6):
         bias.look(last + i * 1e-4, -0.9e-3, SIGMA, 0.0)

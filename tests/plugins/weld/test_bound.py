@@ -16,24 +16,15 @@ from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.following.probing import SOFTER
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
-from tests.plugins.weld.bench import straight
+from tests.plugins.weld.bench import circle, following, straight
 from tools.weld_bench import curved, try_condition
 from tools.weld_conditions import Condition
 
 BEND, DISTANCE = 0.05, 0.04
 
 
-def following(**given: Any) -> Following:
-    return Following.model_validate(given)
-
-
 def foreseen(plan: Path, prior: ModelPrior, settings: Following) -> Predicted:
     return predicted(plan, prior, settings, *best_sweep_fit(prior, settings))
-
-
-def arc() -> Path:
-    angle = np.linspace(0.0, 2.5, 400)
-    return Path(BEND * np.column_stack([np.sin(angle), 1.0 - np.cos(angle), 0.0 * angle]))
 
 
 @pytest.mark.parametrize("sigmas", [2.0, 3.0, 4.0])
@@ -54,13 +45,13 @@ def test_in_a_bend_the_tool_stands_askew_and_turns() -> None:
     """Tip and torch are both on a circle: the chord of 40 mm stands at half its arc to it."""
     prior = ModelPrior(DISTANCE, along_sigma=0.5e-3, tip_sigma=0.3e-3)
     alone = replace(prior, two_walls=False)  # no sweep tells how far ahead the tip is
-    found = foreseen(arc(), alone, following())
+    found = foreseen(Path(circle(BEND)), alone, following())
     chord = np.arcsin(DISTANCE / 2 / BEND)
     half = chord + 2e-3 / DISTANCE  # one wall is pressed by 2 mm, to the left
     middle = (found.s > 0.045) & (found.s < 0.05)
     np.testing.assert_allclose(found.askew[middle], (0.5e-3 * np.sin(half)) ** 2, rtol=0.05)
     np.testing.assert_allclose(found.tip[middle], (0.3e-3 * 2 * np.sin(half)) ** 2, rtol=0.2)
-    swept = foreseen(arc(), prior, following())  # it tells how far ahead the tip is
+    swept = foreseen(Path(circle(BEND)), prior, following())  # it tells how far ahead the tip is
     softer = 2e-3 / SOFTER
     half = chord + softer / DISTANCE
     told = (0.02e-3 * 2 * np.sin(half)) ** 2 + (0.3e-3 * 2 * np.sin(half) ** 2) ** 2
@@ -88,7 +79,7 @@ def test_in_a_bend_the_tool_stands_askew_and_turns() -> None:
 )
 def test_what_is_largest_and_what_lessens_it_is_said(prior: Any, asked: Any, told: str) -> None:
     with pytest.raises(StageError, match=told):
-        check_bound(arc(), ModelPrior(DISTANCE, **prior), following(**asked))
+        check_bound(Path(circle(BEND)), ModelPrior(DISTANCE, **prior), following(**asked))
 
 
 def test_the_follower_states_no_less_than_was_predicted() -> None:

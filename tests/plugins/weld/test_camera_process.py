@@ -2,6 +2,7 @@
 
 import os
 import time
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,7 @@ from flangeye.errors import StageError
 from flangeye.types import BASE, FLANGE, Image, Seed, Transform
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
-from tests.plugins.weld.test_touch import FINGER
+from tests.plugins.weld.cell import FINGER
 
 LONGEST = 20.0
 
@@ -55,18 +56,15 @@ class KnowingCamera(Camera):
         return np.array(self._told, float), np.zeros((len(self._told), 3))
 
 
-class LostCamera(Camera):
-    """Is unplugged."""
+class FailingCamera(Camera):
+    """Is unplugged, or has a client that fails in its own way."""
+
+    def __init__(self, fault: Exception, *given: Any) -> None:
+        super().__init__(*given)
+        self._fault = fault
 
     def frame(self) -> SensorFrame | None:
-        raise DeviceError("stand-in camera: gives no more images")
-
-
-class RaisingCamera(Camera):
-    """Has a client that fails in its own way."""
-
-    def frame(self) -> SensorFrame | None:
-        raise ZeroDivisionError("no light")
+        raise self._fault
 
 
 class CrashingCamera(Camera):
@@ -121,11 +119,12 @@ def test_a_real_torch_is_not_known() -> None:
 @pytest.mark.parametrize(
     ("sensor", "said"),
     [
-        (LostCamera, "^stand-in camera: gives no more images$"),
-        (RaisingCamera, "^stand-in camera: failed with ZeroDivisionError: no light$"),
+        (partial(FailingCamera, DeviceError("stand-in: is unplugged")), "^stand-in: is unplugged$"),
+        (partial(FailingCamera, ZeroDivisionError("no light")),
+         "^stand-in camera: failed with ZeroDivisionError: no light$"),
         (CrashingCamera, "^the finger's camera is lost: its process has ended$"),
     ],
-)
+)  # fmt: skip
 def test_a_camera_that_fails_ends_the_weld_with_its_reason(sensor: Any, said: str) -> None:
     with CameraProcess(job(sensor)) as camera, pytest.raises(DeviceError, match=said):
         first_sight(camera)

@@ -29,6 +29,7 @@ from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
 from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import circle, following
 from tools.weld_bench import FINGER
 
 STIFF = {
@@ -41,10 +42,6 @@ ASKED = Following()
 
 def finger(**given: Any) -> Finger:
     return Finger.model_validate({**FINGER, **given})
-
-
-def following(**given: Any) -> Following:
-    return Following.model_validate(given)
 
 
 def told(check: Any, *given: Any) -> str:
@@ -114,7 +111,7 @@ def test_a_torch_is_within_its_height_of_the_seam(up: float, says: str | None) -
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_weave_turns_the_tool_with_four_fifths_of_the_turn_rate_at_most(share: float) -> None:
     width = share * 0.8 * ASKED.turn_rate * 0.04 / np.pi  # at 1 Hz
-    says = "lower 'weave_frequency' to 0.99, or raise 'turn_rate'" if share > 1.0 else None
+    says = "16 deg/s; lower 'weave_frequency' to 0.99, or raise 'turn_rate'" if share > 1 else None
     assert holds(check_weave, 0.04, following(weave_width=f"{width} m"), says=says)
 
 
@@ -132,10 +129,7 @@ def test_a_tool_that_cannot_hold_swing_or_stand_as_asked_is_refused() -> None:
 @pytest.mark.parametrize("radius", [0.05, -0.08])
 def test_a_tool_stands_to_a_circle_by_half_the_arc_of_its_chord(radius: float) -> None:
     """Once its torch is on it as well, to the inner side; on a straight seam it lies along."""
-    turn = np.linspace(0.0, 2.5, 500)
-    path = Path(abs(radius) * np.column_stack(
-        [np.sin(turn), np.sign(radius) * (1 - np.cos(turn)), 0 * turn]
-    ))  # fmt: skip
+    path = Path(circle(radius))
     half = np.arcsin(0.03 / (2 * abs(radius))) * np.sign(radius)
     assert tool_angles(path, 0.03)[20:60] == pytest.approx(half, abs=0.01)
     assert np.abs(tool_angles(Path(line(0.1)), 0.03)).max() < 1e-9
@@ -219,9 +213,8 @@ def test_a_seam_bends_out_of_its_surface_by_no_more_than_the_tip_stands(
 @pytest.mark.parametrize(("angle", "says"), [(59.0, ""), (61.5, "the tool would be at 6")])
 def test_a_tool_is_never_pushed_round_a_bend(angle: float, says: str) -> None:
     """At 60 deg to the seam it would be; on a circle by half the arc of its chord."""
-    turn, radius = np.linspace(0.0, 3.0, 600), 0.023
-    bend = radius * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
-    found = checked(seam_of(bend), 2 * radius * float(np.sin(np.radians(angle))))
+    radius = 0.023
+    found = checked(seam_of(circle(radius, 3.0)), 2 * radius * float(np.sin(np.radians(angle))))
     assert bool(found) == bool(says) and says in found
 
 

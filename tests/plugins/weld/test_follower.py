@@ -20,7 +20,7 @@ from flangeye_plugins.weld.following.model_prior import ModelPrior, SweepFit
 from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
-from tests.plugins.weld.bench import straight
+from tests.plugins.weld.bench import circle, pose, straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.12, 0.05
 PRESS = 2e-3 / 3
@@ -56,10 +56,6 @@ def put(found: Any, **state: Any) -> Any:
     for name, value in state.items():
         setattr(getattr(found, HOLDS[name]) if name in HOLDS else found, name, value)
     return found
-
-
-def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: float = 0.0) -> Any:
-    return ToolPose(time, np.array([x, y, z]), angle)
 
 
 def felt_along(found: Any, offset: Any, until: float = 0.1) -> None:
@@ -217,18 +213,13 @@ def test_nothing_is_pressed_before_a_wall_was_found_nor_without_touch() -> None:
 
 def test_where_the_seam_curves_the_tip_goes_as_fast_as_it_swerves_by_three_tenths() -> None:
     """Straight on for the time in which it is blind, off a circle by (v t)^2 / 2 R."""
-    found = put(make(plan=circle()), tip=0.05, torch=0.05)
+    found = put(make(plan=circle(RADIUS)), tip=0.05, torch=0.05)
     assert found._agility() == math.inf  # nothing is late
     found.sensing.latency, found.arm.dead_time, found.arm.lag = 0.2, 0.15, 0.25
     way = found._agility() * 0.6
     assert way**2 / (2 * RADIUS) == pytest.approx(0.3e-3, rel=1e-2)
     found.sensing.latency = 1e3
     assert found._agility() == pytest.approx(0.1 * found.task.settings.speed)
-
-
-def circle() -> Any:
-    angle = np.linspace(0.0, 0.8 * np.pi, 600)
-    return RADIUS * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
 
 
 def test_the_tip_slows_down_while_it_is_not_firm_on_its_wall_or_no_image_comes() -> None:
@@ -490,7 +481,7 @@ def test_an_arm_is_no_nearer_to_a_curve_s_centre_than_three_tenths_of_its_radius
 ) -> None:
     """There all places of the curve are equally near."""
     for share, stopped in ((0.68, True), (0.72, False), (-0.72, False)):
-        found = put(make(plan=circle() * [1.0, side, 1.0]), tip=0.1)
+        found = put(make(plan=circle(RADIUS) * [1.0, side, 1.0]), tip=0.1)
         found.progress.place = found.task.plan.at(0.1)
         # Towards the centre by 1 - share of the radius; or as far away from it.
         towards = np.array([0.0, side * RADIUS]) - found.progress.place.point

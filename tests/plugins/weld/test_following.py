@@ -11,13 +11,9 @@ import pytest
 from flangeye_emulators.weld_world.groove import Gap
 from flangeye_plugins.weld.settings import Following
 from tests.crossing import crossed
-from tests.plugins.weld.bench import PERIOD, curved, misplaced, planning_error, straight, weld
+from tests.plugins.weld.bench import PERIOD, curved, misplaced, planning_error, rms, straight, weld
 
 LIMIT = Following().turn_rate
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.mark.parametrize("seam", [pytest.param(straight, marks=pytest.mark.slow), curved])

@@ -14,9 +14,10 @@ from flangeye_plugins.weld.touch.tag_observation import (
     RegionOfInterest,
     cut,
 )
+from tests.plugins.weld.cell import FINGER
 from tests.plugins.weld.test_camera_process import Camera, state
 from tests.plugins.weld.test_look import Looker, nobody
-from tests.plugins.weld.test_touch import FINGER, Eye, displacements
+from tests.plugins.weld.test_touch import Eye, displacements
 
 CORNERS = np.array([[100.0, 60.5], [180.0, 60.0], [180.2, 140.0], [100.0, 140.0]])
 

@@ -12,16 +12,15 @@ from flangeye.errors import StageError
 from flangeye.plugin.registry import Lookup, load_registry
 from flangeye.plugin.stage import BoundPart
 from flangeye.types import Seed
-from flangeye.workflow.log.record import Recorder
 from flangeye.workflow.run.replay import replay_steps
 from flangeye_emulators.finger.profiler import SimulatedProfilerParams, profiler_simulated
 from flangeye_emulators.weld_world.truth import ClockTruth, ProfilerTruth, ToolTruth, WeldTruth
 from flangeye_plugins.weld.camera_process import CameraProcess
 from flangeye_plugins.weld.finger_camera import CameraJob
 from flangeye_plugins.weld.settings import WeldTactileParams
-from tests.plugins.weld.cell import planned, run
+from tests.plugins.weld.cell import FINGER, planned, run
 from tests.plugins.weld.test_camera_process import Camera, first_sight, state
-from tests.plugins.weld.test_touch import FINGER
+from tests.plugins.weld.test_replay import logged
 from tools.weld_bench import try_condition
 from tools.weld_conditions import CONDITIONS, Condition
 
@@ -36,14 +35,6 @@ def weld() -> Any:
     return run(
         planned("v-straight", end=0.06), seed=3, sensor={"world": ASIDE}, profiler=LOOK, **SETTINGS
     )
-
-
-def logged(journal: Any, path: Path) -> Path:
-    recorder = Recorder(path, {}, False)
-    for name, value in journal:
-        recorder.flangeye_noted(step="7.weld.tactile", name=name, value=value)
-    recorder.close()
-    return path
 
 
 def test_a_weld_is_led_by_what_is_seen_behind_its_torch(weld: Any) -> None:
@@ -159,7 +150,7 @@ def test_heat_around_the_torch_is_made_up_for_once_it_was_seen() -> None:
         CONDITIONS["heat: 1 mm around the torch, with a profiler behind"], 0, SHORT, 16e-3
     )
     assert found.done
-    assert (found.errors <= found.column("bound")[found.beside]).all()
+    assert found.bounded
     assert found.errors.max() > 0.9e-3  # nothing is seen of the first 30 mm
     assert np.sqrt(np.mean(late(found, 0.05) ** 2)) < 0.1e-3
 

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 
 from flangeye_plugins.weld.following.model_prior import ModelPrior
 from flangeye_plugins.weld.frame import leaning
-from flangeye_plugins.weld.settings import Following
+from tests.plugins.weld.bench import following
 
 RIGHT_ANGLE = math.pi / 4
 
 
 def leant(work: float) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in leaning(work, 0.1).tolist())
-
-
-def settings(**given: Any) -> Following:
-    return Following.model_validate(given)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -37,7 +32,7 @@ def test_pressing_costs_the_force_of_springs_whose_tip_may_slide_along_the_seam(
         moved = np.array([along, *across])
         return float(moved @ stiff @ moved / 2)
 
-    found = prior.pressing(settings(side=side))
+    found = prior.pressing(following(side=side))
     assert found[0, 0] == pytest.approx(2 * energy(1.0, 0.0))
     assert found[1, 1] == pytest.approx(2 * energy(0.0, 1.0))
     both = energy(1.0, 1.0) - energy(1.0, 0.0) - energy(0.0, 1.0)
@@ -46,7 +41,7 @@ def test_pressing_costs_the_force_of_springs_whose_tip_may_slide_along_the_seam(
 
 def test_an_upright_finger_is_held_by_its_preload_over_its_deflection_and_the_wall() -> None:
     """Axial stiffness times preload times cot(half angle), over lateral times deflection."""
-    prior, asked = ModelPrior(0.04, 1000.0, 3000.0, 0.6), settings()
+    prior, asked = ModelPrior(0.04, 1000.0, 3000.0, 0.6), following()
     ratio = 3000.0 * asked.preload / math.tan(0.6) / (1000.0 * asked.deflection)
     assert prior.seating(asked) == pytest.approx(ratio)
     friction = asked.friction * 3000.0 * asked.preload
@@ -60,7 +55,7 @@ def test_an_upright_finger_is_held_by_its_preload_over_its_deflection_and_the_wa
 
 @pytest.mark.parametrize(("side", "wall"), [("left", 0.8), ("right", 0.4)])
 def test_the_pressed_wall_is_that_of_the_side(side: str, wall: float) -> None:
-    prior, asked = ModelPrior(0.04, 1000.0, 2000.0, 0.6, lean=0.2), settings(side=side)
+    prior, asked = ModelPrior(0.04, 1000.0, 2000.0, 0.6, lean=0.2), following(side=side)
     forces = 2000.0 * asked.preload / (1000.0 * asked.deflection * math.tan(wall))
     assert prior.seating(asked) == pytest.approx(forces)
     sign = 1.0 if side == "left" else -1.0
@@ -74,7 +69,7 @@ def test_the_pressed_wall_is_that_of_the_side(side: str, wall: float) -> None:
 def test_beside_one_upright_wall_the_tip_comes_down_half_the_reach_away_from_it(
     side: str, sign: float
 ) -> None:
-    asked, two = settings(side=side), ModelPrior(0.04, half_angle=0.5)
+    asked, two = following(side=side), ModelPrior(0.04, half_angle=0.5)
     assert two.set_down(asked) == 0.0 and two.beside == pytest.approx(0.0)
     one = ModelPrior(
         0.04, half_angle=RIGHT_ANGLE, lean=-sign * RIGHT_ANGLE, two_walls=False, radius=2e-3
@@ -85,7 +80,7 @@ def test_beside_one_upright_wall_the_tip_comes_down_half_the_reach_away_from_it(
 
 
 def test_what_nothing_measures_adds_up_to_how_well_the_torch_is_known() -> None:
-    asked = settings()
+    asked = following()
     own = ModelPrior(0.04, torch_sigma=7e-5)
     creep = 0.02 * asked.deflection
     squares = 49e-10 + (2 * asked.arm_sigma) ** 2 + asked.distortion**2 + creep**2
@@ -101,12 +96,10 @@ def test_what_nothing_measures_adds_up_to_how_well_the_torch_is_known() -> None:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_tip_is_just_held_by_the_deflection_that_its_remedy_names(side: str) -> None:
+def test_a_tip_is_just_held_by_what_its_remedy_names(side: str) -> None:
     """Whatever way the tool leans; a little more and it climbs."""
-    prior, asked = (
-        ModelPrior(0.04, 900.0, 2100.0, 0.6, lean=0.1, level_R_tool=leant(0.3)),
-        settings(side=side),
-    )
-    deflection, _ = prior.remedy(asked, 1.0)
-    just = settings(side=side, deflection=f"{deflection!r} m")
-    assert prior.seating(just) == pytest.approx(1.0)
+    prior = ModelPrior(0.04, 900.0, 2100.0, 0.6, lean=0.1, level_R_tool=leant(0.3))
+    for share in (1.0, 1.4):
+        deflection, preload = prior.remedy(following(side=side), share)
+        for better in ({"deflection": f"{deflection!r} m"}, {"preload": f"{preload!r} m"}):
+            assert prior.seating(following(side=side, **better)) == pytest.approx(share)

@@ -5,21 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flangeye.files.paths import bundled
 from flangeye.maths.seam_geometry import torch_deviation
-from flangeye.models.finger import Finger
-from flangeye.models.model import read_model
-from flangeye.motion.seam_following import Command, turned
+from flangeye.motion.seam_following import Command
 from flangeye.types import Transform
 from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_emulators.weld_world.groove import Groove, GrooveSection, Tip
 from flangeye_emulators.weld_world.groove import TipContact as Tip3D
-from flangeye_plugins.weld.following.refined import RefinedPath
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.path import Path
-from tests.plugins.weld.bench import curved, misplaced, straight
-
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
+from tests.plugins.weld.bench import straight
+from tests.plugins.weld.cell import FINGER
 
 
 def test_progress_neither_goes_back_nor_jumps_to_another_branch() -> None:
@@ -40,30 +35,6 @@ def test_progress_neither_goes_back_nor_jumps_to_another_branch() -> None:
 def test_the_curvature_of_a_path_is_not_its_scatter_s() -> None:
     scatter = straight() + 0.02e-3 * np.random.default_rng(0).standard_normal((200, 3))
     assert Path(scatter).sharpest(0.0, 0.12) < 5.0
-
-
-# --- the refined path -----------------------------------------------------------------------------
-
-
-def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was() -> None:
-    true, plan = Path(curved()), Path(misplaced(curved(), (1e-3, 2e-3, 0.0), np.deg2rad(1.0)))
-    refined = RefinedPath(plan, 0.05)
-    for s in np.concatenate([np.arange(0.03, 0.05, 2e-4), np.arange(0.07, 0.09, 2e-4)]):
-        place = plan.at(float(s))
-        foot = true.foot(place.point, float(s))
-        for _ in range(3):  # the true seam across the plan
-            at = true.at(foot)
-            foot -= float((at.point - place.point) @ place.tangent) / float(
-                at.tangent @ place.tangent
-            )
-        offset = float((true.at(foot).point - place.point) @ place.normal)
-        refined.add(float(s), offset, 0.0)
-    refined.renew(-0.05, 100_000)
-    for s in (0.02, 0.04, 0.06, 0.08, 0.1):
-        point, normal = refined.frame(s)
-        foot = true.foot(point, s)
-        assert np.linalg.norm(true.at(foot).point - point) < 0.05e-3
-        assert normal @ true.at(foot).normal > np.cos(np.deg2rad(0.5))
 
 
 # --- the tool on its flange -----------------------------------------------------------------------
@@ -90,10 +61,6 @@ def test_the_flange_moves_as_the_tip_is_told(angle: float, yaw: float, turn: flo
         (after.position - before.position) / step, [5e-3, -2e-3, 1e-3], atol=1e-5
     )
     assert (after.angle - before.angle) / step == pytest.approx(turn, abs=1e-5)
-
-
-def test_turning_is_about_the_normal() -> None:
-    np.testing.assert_allclose(turned(np.array([1.0, 0.0, 2.0]), np.pi / 2), [0, 1, 2], atol=1e-12)
 
 
 # --- the simulated tip ----------------------------------------------------------------------------
@@ -144,46 +111,3 @@ def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam() -> 
     points = np.array([[-0.01, 0, 0], [0.05, 2e-3, 7e-3], [0.2, 0, 0]])
     found = torch_deviation(points, line, np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(found, [2e-3])
-
-
-@pytest.mark.parametrize("bow", [-3e-3, 3e-3])
-def test_a_plan_whose_shape_is_wrong_is_stated_beyond_what_was_felt(bow: float) -> None:
-    """A bow that shift and turn nearly explain leads the plan elsewhere beyond its last sample."""
-    plan = Path(curved(0.1))
-    rng = np.random.default_rng(0)
-    refined = RefinedPath(plan, 0.05)
-    refined.noise = 30e-6
-
-    def bowed(s):
-        return bow * np.sin(np.pi * s / plan.length)
-
-    for s in np.arange(5e-3, plan.length - 10e-3, 2e-4):
-        refined.add(s, bowed(s) + refined.noise * rng.standard_normal(), 0.0)
-    refined.renew(-0.05, 100_000)
-    for s in np.arange(plan.length - 10e-3, plan.length, 1e-3):
-        off = abs(refined.offset(s) - bowed(s))
-        assert off < 4 * np.sqrt(refined.variance(s)) < 4e-3
-
-
-def test_waves_felt_in_two_short_pieces_are_not_taken_for_a_plan_turned_far() -> None:
-    """A turn by 16 deg and a shift by 35 mm explain both; between them the wave goes on."""
-    refined = RefinedPath(Path(curved(0.1)), 0.05)
-    refined.noise, rng = 60e-6, np.random.default_rng(0)
-
-    def wave(s):
-        return -1.3e-3 * np.cos(2 * np.pi * (s - 10.5e-3) / 28e-3) - 0.9e-3
-
-    for s in [*np.arange(6e-3, 13e-3, 0.6e-3).tolist(), 27.5e-3, 28e-3]:
-        refined.add(s, wave(s) + refined.noise * rng.standard_normal(), 0.0)
-    refined.renew(-0.05, 100_000)
-    for s in np.arange(14e-3, 27e-3, 1e-3):
-        assert abs(refined.offset(s) - wave(s)) < 4 * np.sqrt(refined.variance(s))
-
-
-def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
-    few, many = RefinedPath(Path(straight()), 0.05), RefinedPath(Path(straight()), 0.05)
-    for refined, end in ((few, 1e-3), (many, 40e-3)):
-        for s in np.arange(0.0, end, 2e-4):
-            refined.add(s, 1e-3, 0.0)
-        refined.renew(-0.05, 100_000)
-    assert few.variance(11e-3) > 20 * many.variance(50e-3)

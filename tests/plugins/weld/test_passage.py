@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
-from flangeye.models.finger import Finger
 from flangeye.models.loading import load_model
-from flangeye.models.model import read_model
 from flangeye.plugin.stage import BoundPart
 from flangeye.workflow.recipe.header import LimitsSection
 from flangeye_emulators.finger.sensor import (
@@ -18,9 +15,8 @@ from flangeye_plugins.weld.following.task import WeldStart
 from flangeye_plugins.weld.frame import Tool, WorkSurface
 from flangeye_plugins.weld.reachability import JUMP, ROOM, SeamReach, Task
 from flangeye_plugins.weld.settings import WeldTactileParams
-from tests.plugins.weld.cell import BOX, planned
+from tests.plugins.weld.cell import BOX, FINGER, planned
 
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 SENSOR = BoundPart(sensor_simulated_finger, SimulatedFingerParams())
 
 

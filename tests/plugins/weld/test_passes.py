@@ -16,15 +16,10 @@ from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTas
 from flangeye_plugins.weld.passes import MultiPassController, RootPass
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
-from tests.plugins.weld.bench import straight
+from tests.plugins.weld.bench import circle, pose, straight
 
 DISTANCE, LENGTH, RADIUS = 40e-3, 0.1, 0.08
 SIGMA = 0.1e-3
-
-
-def circle() -> Floats:
-    turn = np.linspace(0.0, LENGTH / RADIUS, 400)
-    return RADIUS * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
 
 
 class Root:
@@ -64,10 +59,6 @@ def passes(
     root: Any = Root(plan, aside)
     root.task = WeldTask(plan, ModelPrior(DISTANCE), settings, before=before, given=start)
     return MultiPassController(root)
-
-
-def pose(x: float, y: float = 0.0, z: float = 0.0, angle: float = 0.0, time: float = 0.0) -> Any:
-    return ToolPose(time, np.array([x, y, z]), angle)
 
 
 def rooted(found: Any, height: float = -1e-3) -> Any:
@@ -112,7 +103,7 @@ def test_the_height_of_the_root_pass_is_kept_every_half_millimetre() -> None:
     assert later.rows == traced.rows and later.sigma(4e-3) == pytest.approx(SIGMA + 4e-3)
 
 
-@pytest.mark.parametrize("points", [straight(LENGTH), circle()])
+@pytest.mark.parametrize("points", [straight(LENGTH), circle(RADIUS, LENGTH / RADIUS)])
 def test_a_pass_goes_aside_of_what_was_found_and_higher_than_the_tool_was(points: Any) -> None:
     found = rooted(passes({"across": "2 mm", "up": "4 mm"}, points=points,
                           aside=0.5e-3))  # fmt: skip
@@ -147,7 +138,7 @@ def test_between_passes_the_tool_is_lifted_crosses_and_comes_down_where_the_pass
     assert max(abs(row[1].turn) for row in rows[:-1]) <= found._settings.turn_rate
 
 
-@pytest.mark.parametrize("points", [straight(LENGTH), circle()])
+@pytest.mark.parametrize("points", [straight(LENGTH), circle(RADIUS, LENGTH / RADIUS)])
 def test_the_torch_goes_along_its_pass_and_the_passes_after_it_follow(points: Any) -> None:
     found = rooted(
         passes({"across": "1 mm"}, {"across": "-2 mm"}, points=points),

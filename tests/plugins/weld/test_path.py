@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye_plugins.weld.path import Path
+from tests.plugins.weld.bench import circle
 
 CORNER = Path(np.array([[0.0, 0.0, 0.0], [0.03, 0.04, 0.002], [0.03, 0.08, 0.002]]))
 """50 mm that climb by 2, then 40 mm that do not."""
@@ -43,16 +44,9 @@ def test_beyond_its_ends_it_goes_on_straight_and_level() -> None:
     assert CORNER.climb(0.0) == pytest.approx(0.04)
 
 
-def arc(radius: float, angle: float = 1.5) -> Path:
-    turn = np.linspace(0.0, angle, 300)
-    return Path(abs(radius) * np.column_stack(
-        [np.sin(turn), np.sign(radius) * (1 - np.cos(turn)), 0 * turn]
-    ))  # fmt: skip
-
-
 @pytest.mark.parametrize("radius", [0.05, -0.08])
 def test_curvature_is_one_over_the_radius_to_the_left_positive(radius: float) -> None:
-    path = arc(radius)
+    path = Path(circle(radius, 1.5))
     for s in (0.0, 0.02, path.length):
         assert path.bend(s) == pytest.approx(1 / radius, rel=0.02)
     assert path.bend(-1e-6) == path.bend(path.length + 1e-6) == 0.0
@@ -72,7 +66,7 @@ def test_a_corner_is_curved_where_it_is_by_what_it_turns_within_five_millimetres
 
 
 def test_a_foot_is_found_forwards_and_back_and_progress_only_forwards() -> None:
-    path = arc(0.05)
+    path = Path(circle(0.05, 1.5))
     place = path.at(0.03)
     aside = place.point + 2e-3 * place.normal
     for near in (0.028, 0.03, 0.032):
@@ -83,8 +77,8 @@ def test_a_foot_is_found_forwards_and_back_and_progress_only_forwards() -> None:
 
 
 def test_at_its_very_end_a_path_is_at_its_last_point_and_climbs_as_it_does_there() -> None:
-    turn = np.linspace(0.0, 1.5, 300)
-    path = Path(0.05 * np.column_stack([np.sin(turn), 1 - np.cos(turn), turn**2]))
+    rising = [0, 0, 0.05] * np.linspace(0.0, 1.5, 600)[:, None] ** 2
+    path = Path(circle(0.05, 1.5) + rising)
     end = path.at(path.length)
     assert end.point == pytest.approx(path.points[-1, :2], abs=1e-12)
     assert end.tangent == pytest.approx(path.tangents[-1] / np.linalg.norm(path.tangents[-1]))

@@ -33,33 +33,9 @@ CONE = np.radians(
 TIP, TORCH = np.array([1.5e-3, -0.8e-3, 181e-3]), np.array([-38e-3, 1.2e-3, 184e-3])
 
 
-def poses_about(
-    point: NDArray[np.float64], mark: NDArray[np.float64], noise: float = 0.0, seed: int = 0
-) -> list[NDArray[np.float64]]:
-    rng = np.random.default_rng(seed)
-    upright = rotation_exp([np.pi, 0.0, 0.0])
-    turns = [upright @ rotation_exp(turn) for turn in CONE]
-    return [rigid(r, mark - r @ point + noise * rng.standard_normal(3)) for r in turns]
-
-
-def test_the_point_is_found_with_its_covariance() -> None:
-    mark = np.array([0.6, 0.1, 0.2])
-    exact = pivot("tip", poses_about(TIP, mark))
-    np.testing.assert_allclose(exact.point, TIP, atol=1e-12)
-    np.testing.assert_allclose(exact.mark, mark, atol=1e-12)
-    squared = []
-    for seed in range(200):
-        found = pivot("tip", poses_about(TIP, mark, 0.1e-3, seed))
-        off = found.point - TIP
-        squared.append(off @ np.linalg.inv(found.covariance) @ off / 3)
-    assert np.median(squared) == pytest.approx(0.8, abs=0.15)  # chi2 of 3, over 3
-
-
 @pytest.mark.parametrize(
     ("turns", "message"),
     [
-        (CONE[:4], "4 poses, at least 5 are needed"),
-        (CONE * [0.1, 0.1, 0.1], "the tool was hardly turned; tilt it about the flange's x and y"),
         (CONE * [0, 0, 1] + np.outer(np.linspace(-0.7, 0.7, 7), [0, 0, 1]),
          "the point's z in the flange is not observable; tilt it about x and y"),
         (CONE * [1, 0, 0], "the point's x in the flange is not observable; tilt it about y and z"),

@@ -17,34 +17,52 @@ FLAT = math.tan(math.radians(40.0))
 PERIOD, IMAGES = 8e-3, 4
 
 
-def swept(held=2.0, noise=10e-6, pressed=1.2e-3, seed=0, ahead=0.0, prior=BELIEF):
-    """Sweep a tip; return what is learned, the probing, and the largest true deflection [m].
+def drive(
+    probing, where, *, side=1.0, held=9.0, noise=0.0, ahead=0.0, finger=(0.0, 0.0, 0.0), lag=0.0,
+    late=0.0, seed=0,
+):  # fmt: skip
+    """Let an arm carry out a sweep to its end; return its places [m] and speeds [m/s], outwards.
 
     Args:
+        probing: The sweep.
+        where: Deflection at which it begins [m].
+        side: Side that is pressed.
         held: Share of the wanted deflection up to which the preload holds the tip.
         noise: Of one measurement across; six times as much in height [m].
-        pressed: Deflection at which the sweep begins [m].
-        seed: Of the noise.
         ahead: The tip is ahead of where its file has it by this [m].
-        prior: What is expected.
+        finger: Its gain error, half of its play [m], and where in that it begins, from -1 to 1.
+        lag: Time constant of the arm [s].
+        late: Of the timestamps [s].
+        seed: Of the noise.
     """
-    probing, rng = Probing(SETTINGS, prior, 1.0), np.random.default_rng(seed)
-    probing.begin(noise)
-    where, turned, hardest, cycle, found = pressed, 0.0, 0.0, 0, None
-    while found is None:
-        speed, turn = probing.velocity(PERIOD)
-        probing.note(cycle * PERIOD, speed, where, math.sin(turned))
+    rng, (gain, half, began) = np.random.default_rng(seed), finger
+    shown, speed, turned, rows = began * half - where, 0.0, 0.0, []
+    for cycle in range(8000):
+        told, turn = probing.velocity(PERIOD)
+        probing.note(cycle * PERIOD, told, side * where, math.sin(turned))
+        # On its wall the tip goes by 0.4 of what the arm goes on by: aside, and so up.
+        aside = 0.4 * max(where - held * SETTINGS.deflection, 0.0)
+        shown = float(np.clip(shown, aside - where - half, aside - where + half))
         if cycle % IMAGES == 0:
-            # On its wall the tip goes by 0.4 of what the arm goes on by: aside, and so up.
-            aside = 0.4 * max(where - held * SETTINGS.deflection, 0.0)
             across, height = noise * rng.standard_normal(2) * [1.0, 6.0]
-            shown = aside - where - ahead * math.sin(turned)
-            probing.feel(cycle * PERIOD, shown + across, aside / FLAT + height, 0.0)
-        where, turned, cycle = where + speed * PERIOD, turned + turn * PERIOD, cycle + 1
-        hardest = max(hardest, where)
-        assert cycle * PERIOD < 60.0
-        found = probing.learned() if probing.over else None
-    assert turned == pytest.approx(0.0, abs=1e-9)
+            seen = side * (1.0 + gain) * shown - ahead * math.sin(turned)
+            probing.feel(cycle * PERIOD + late, seen + across, aside / FLAT + height, 0.0)
+        speed += (side * told - speed) * (PERIOD / lag if lag else 1.0)
+        where, turned = where + speed * PERIOD, turned + turn * PERIOD
+        rows.append((where, side * told))
+        if probing.over:
+            break
+    assert probing.over and turned == pytest.approx(0.0, abs=1e-9)
+    return np.array(rows).T
+
+
+def swept(noise=10e-6, pressed=1.2e-3, prior=BELIEF, **given):
+    """Sweep a tip; return what is learned, and the largest true deflection [m]."""
+    probing, hardest, found = Probing(SETTINGS, prior, 1.0), 0.0, None
+    probing.begin(noise)
+    while found is None:
+        places, _ = drive(probing, pressed, noise=noise, **given)
+        pressed, hardest, found = places[-1], max(hardest, places.max()), probing.learned()
     return found, hardest
 
 
@@ -96,23 +114,6 @@ def going(two_walls: bool = True, side: float = 1.0, noise: float = 10e-6, **giv
     return found
 
 
-def driven(found: Any, pressed: float, side: float = 1.0) -> tuple[Any, Any]:
-    """Let a finger of no noise be swept from where it is pressed by so much; places and speeds [m]."""
-    where, speeds, places = pressed, list[float](), list[float]()
-    for cycle in range(6000):
-        speed, _ = found.velocity(PERIOD)
-        found.note(cycle * PERIOD, speed, side * where)
-        if cycle % IMAGES == 0:
-            found.feel(cycle * PERIOD, -side * where, 0.0, 0.0)
-        where += side * speed * PERIOD
-        speeds.append(side * speed)
-        places.append(where)
-        if found.over:
-            break
-    assert found.over
-    return np.array(places), np.array(speeds)
-
-
 def turns_of(places: Any) -> list[float]:
     """Where a way turns round, and where it ends [m]."""
     steps = np.sign(np.round(np.diff(places), 12))
@@ -124,7 +125,7 @@ def turns_of(places: Any) -> list[float]:
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_tip_between_walls_is_pressed_to_both_and_ends_outwards(side: float) -> None:
     d = SETTINGS.deflection
-    places, speeds = driven(going(side=side), 0.5e-3, side)
+    places, speeds = drive(going(side=side), 0.5e-3, side=side)
     ends = [1.25 * d, -1.25 * d, 1.25 * d, -1.25 * d, 1.25 * d / 3]
     assert turns_of(places) == pytest.approx(ends, abs=1e-6)
     assert np.abs(speeds).max() <= 4e-3 + 1e-12
@@ -133,7 +134,7 @@ def test_a_tip_between_walls_is_pressed_to_both_and_ends_outwards(side: float) -
 
 def test_a_tip_on_one_wall_keeps_pressing_it() -> None:
     d = SETTINGS.deflection
-    places, _ = driven(going(two_walls=False), 0.5e-3)
+    places, _ = drive(going(two_walls=False), 0.5e-3)
     assert turns_of(places) == pytest.approx([1.25 * d, 0.375 * d, 0.75 * d], abs=1e-6)
 
 
@@ -259,18 +260,9 @@ def test_measurements_scatter_as_their_second_differences_do() -> None:
 def test_where_in_its_play_a_finger_began_changes_nothing(
     began: float, half: float, late: float, gain: float
 ) -> None:
-    """Its own generator: an arm that lags, a dead band, images with late stamps, known truth."""
-    found, rng = going(), np.random.default_rng(5)
-    where, speed, shown, cycle = 1.2e-3, 0.0, -1.2e-3 + began * half, 0
-    while not found.over:
-        told, _ = found.velocity(PERIOD)
-        found.note(cycle * PERIOD, told, where)
-        shown = float(np.clip(shown, -where - half, -where + half))
-        if cycle % IMAGES == 0:
-            seen = (1.0 + gain) * shown + 10e-6 * rng.standard_normal()
-            found.feel(cycle * PERIOD + late, seen, 0.0, 0.0)
-        speed += (told - speed) * PERIOD / 0.2
-        where, cycle = where + speed * PERIOD, cycle + 1
+    """With an arm that lags, and images with late stamps."""
+    found = going()
+    drive(found, 1.2e-3, noise=10e-6, finger=(gain, half, began), lag=0.2, late=late, seed=5)
     learned = found.learned()
     assert isinstance(learned, SweepFit)
     assert learned.width == pytest.approx((1.0 + gain) * half, abs=0.02e-3)

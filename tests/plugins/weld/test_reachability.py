@@ -10,9 +10,6 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.paths import bundled
-from flangeye.models.finger import Finger
-from flangeye.models.model import read_model
 from flangeye.motion.limits import MotionLimits
 from flangeye.motion.route import NoRoute, Route
 from flangeye_plugins.weld import reachability
@@ -22,8 +19,8 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import Barrier, SeamReach, Station, _stations, flange_speed
 from flangeye_plugins.weld.settings import Following
 from tests.plugins.weld.bench import straight
+from tests.plugins.weld.cell import FINGER
 
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 FREE = Barrier(9, "")
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from flangeye_plugins.weld.following.refined import CORRELATIONS, PRIOR, SIZES, RefinedPath, _Field
 from flangeye_plugins.weld.path import PATH_SPACING, Path
-from tests.plugins.weld.bench import curved, straight
+from tests.plugins.weld.bench import curved, misplaced, straight
 
 ALL = 100_000
 
@@ -21,6 +21,11 @@ def felt(seam, along, noise=10e-6, plan=None, seed=0):
         found.add(s, float(seam(s)) + noise * rng.standard_normal(), 0.2)
     found.renew(-0.05, ALL)
     return found
+
+
+def level(along, noise=10e-6):
+    """Return what is believed of a straight seam of 0.12 m that was felt where it was planned."""
+    return felt(lambda s: 0.0, along, noise, Path(straight(0.12)))
 
 
 def matern(apart, size, length):
@@ -86,14 +91,9 @@ def test_what_is_stated_of_the_seam_is_what_it_is_off_by(seam, noise) -> None:
 
 
 def test_what_is_felt_later_smooths_what_the_tip_has_passed_until_the_torch_has_too() -> None:
-    places = np.arange(5e-3, 60e-3, 1e-3)
-    found = RefinedPath(Path(straight(0.12)), 0.05)
-    found.noise = 0.1e-3
-    for s in places[places < 30e-3].tolist():
-        found.add(s, 0.0, 0.0)
-    found.renew(-0.05, ALL)
+    found = level(np.arange(5e-3, 30e-3, 1e-3), 0.1e-3)
     before = found.variance(29e-3)
-    for s in places[places >= 30e-3].tolist():
+    for s in np.arange(30e-3, 60e-3, 1e-3).tolist():
         found.add(s, 0.0, 0.0)
     found.renew(28e-3, ALL)
     assert found.variance(29e-3) < 0.8 * before
@@ -150,3 +150,54 @@ def test_what_is_felt_again_behind_the_tip_is_left_out() -> None:
     found.add(0.02, 9e-3, 0.0)
     found.renew(-0.05, ALL)
     assert found.offset(0.02) == before
+
+
+def test_where_nothing_was_felt_the_plan_is_moved_onto_what_was() -> None:
+    true, plan = Path(curved()), Path(misplaced(curved(), (1e-3, 2e-3, 0.0), np.deg2rad(1.0)))
+    refined = RefinedPath(plan, 0.05)
+    for s in np.concatenate([np.arange(0.03, 0.05, 2e-4), np.arange(0.07, 0.09, 2e-4)]):
+        place = plan.at(float(s))
+        foot = true.foot(place.point, float(s))
+        for _ in range(3):  # the true seam across the plan
+            at = true.at(foot)
+            foot -= float((at.point - place.point) @ place.tangent) / float(
+                at.tangent @ place.tangent
+            )
+        offset = float((true.at(foot).point - place.point) @ place.normal)
+        refined.add(float(s), offset, 0.0)
+    refined.renew(-0.05, 100_000)
+    for s in (0.02, 0.04, 0.06, 0.08, 0.1):
+        point, normal = refined.frame(s)
+        foot = true.foot(point, s)
+        assert np.linalg.norm(true.at(foot).point - point) < 0.05e-3
+        assert normal @ true.at(foot).normal > np.cos(np.deg2rad(0.5))
+
+
+@pytest.mark.parametrize("bow", [-3e-3, 3e-3])
+def test_a_plan_whose_shape_is_wrong_is_stated_beyond_what_was_felt(bow: float) -> None:
+    """A bow that shift and turn nearly explain leads the plan elsewhere beyond its last sample."""
+    length = Path(curved(0.1)).length
+
+    def bowed(s):
+        return bow * np.sin(np.pi * s / length)
+
+    found = felt(bowed, np.arange(5e-3, length - 10e-3, 2e-4), 30e-6)
+    for s in np.arange(length - 10e-3, length, 1e-3):
+        off = abs(found.offset(s) - bowed(s))
+        assert off < 4 * np.sqrt(found.variance(s)) < 4e-3
+
+
+def test_waves_felt_in_two_short_pieces_are_not_taken_for_a_plan_turned_far() -> None:
+    """A turn by 16 deg and a shift by 35 mm explain both; between them the wave goes on."""
+
+    def wave(s):
+        return -1.3e-3 * np.cos(2 * np.pi * (s - 10.5e-3) / 28e-3) - 0.9e-3
+
+    found = felt(wave, [*np.arange(6e-3, 13e-3, 0.6e-3).tolist(), 27.5e-3, 28e-3], 60e-6)
+    for s in np.arange(14e-3, 27e-3, 1e-3):
+        assert abs(found.offset(s) - wave(s)) < 4 * np.sqrt(found.variance(s))
+
+
+def test_what_was_felt_at_two_places_says_little_of_the_rest() -> None:
+    few, many = (level(np.arange(0.0, end, 2e-4)) for end in (1e-3, 40e-3))
+    assert few.variance(11e-3) > 20 * many.variance(50e-3)

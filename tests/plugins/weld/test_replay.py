@@ -9,19 +9,15 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.paths import bundled
-from flangeye.models.finger import Finger
-from flangeye.models.model import read_model
 from flangeye.plugin.registry import load_registry
 from flangeye.workflow.log.read import read_notes
 from flangeye.workflow.log.record import Recorder
 from flangeye.workflow.run.replay import replay_steps
 from flangeye_plugins.sensor import McapParams, sensor_mcap
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
-from tests.plugins.weld.cell import welded
+from tests.plugins.weld.cell import FINGER, welded
 
 STEP = "7.weld.tactile"
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import RUN_IN, controller_of, restart, resume_point_of
 from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
 from tests.plugins.weld import bench
-from tests.plugins.weld.bench import DISTANCE, straight
+from tests.plugins.weld.bench import DISTANCE, circle, straight
 from tests.plugins.weld.cell import planned, run, true_line
 from tests.plugins.weld.test_replay import logged
 
@@ -136,9 +136,7 @@ def test_a_weld_goes_on_no_nearer_to_its_end_than_the_tip_can_press() -> None:
 @pytest.mark.parametrize("heading", [0.0, 3.0, -3.0])
 def test_on_a_bend_the_tool_is_set_down_along_the_chord_from_torch_to_tip(heading: float) -> None:
     radius, c, s = 0.06, np.cos(heading), np.sin(heading)
-    turn = np.linspace(0.0, 3.0, 900)
-    bend = radius * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
-    plan = Path(bend @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
+    plan = Path(circle(radius, 3.0) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
     half = np.arcsin(DISTANCE / 2 / radius)  # the chord's angle to the circle
     for number in (0, 1):
         params = PARAMS.model_copy(update={"passes": (PassParams(),)})

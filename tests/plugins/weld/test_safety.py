@@ -8,9 +8,6 @@ import pytest
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
-from flangeye.files.paths import bundled
-from flangeye.models.finger import Finger
-from flangeye.models.model import read_model
 from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
@@ -21,9 +18,8 @@ from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from tests.motion.stand_in import LIMITS, StandIn
 from tests.motion.stand_in import MODEL as STAND_IN
-from tests.plugins.weld.cell import HOME, MODEL, planned, run
+from tests.plugins.weld.cell import FINGER, HOME, MODEL, planned, run
 
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 SHORT = 0.05
 
 

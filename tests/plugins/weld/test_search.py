@@ -17,9 +17,11 @@ PRELOAD, REACH = SETTINGS.preload, SETTINGS.reach
 QUIET = ModelPrior(40e-3, noise=(1e-9, 1e-9))
 
 
-def rested(prior: ModelPrior = QUIET, rest: Any = (0.0, 0.0, 0.0)) -> SweepSearch:
+def rested(
+    prior: ModelPrior = QUIET, rest: Any = (0.0, 0.0, 0.0), settings: Following = SETTINGS
+) -> SweepSearch:
     """Return a search whose tip was measured in the air."""
-    search = SweepSearch(SETTINGS, prior)
+    search = SweepSearch(settings, prior)
     for _ in range(10):
         assert search.resting
         search.feel(np.array(rest), 0.0, 0.0)
@@ -114,10 +116,15 @@ def test_a_seat_bears_when_its_preload_is_right_to_a_tenth() -> None:
         assert fed(search, 15, 0.0, share * PRELOAD).seated == seated
 
 
-def test_a_wall_is_felt_beyond_what_friction_gives() -> None:
-    wall = max(1.1 * QUIET.sliding(SETTINGS), SETTINGS.probe / 2)
+@pytest.mark.parametrize("friction", [SETTINGS.friction, 0.0])
+def test_a_wall_is_felt_beyond_what_friction_gives_and_half_of_what_the_tip_probes_by(
+    friction: float,
+) -> None:
+    settings = Following.model_validate({"friction": friction})
+    wall = max(1.1 * QUIET.sliding(settings), settings.probe / 2)
+    assert friction or wall == settings.probe / 2
     for share, found in ((0.98, False), (1.02, True), (-0.98, False), (-1.02, True)):
-        search = fed(rested(), 3, 0.0, PRELOAD)
+        search = fed(rested(settings=settings), 3, 0.0, PRELOAD)
         assert fed(search, 15, share * wall, PRELOAD).found == found
         if found:
             assert fed(search, 15, 0.0, PRELOAD).found  # it stays so
@@ -135,18 +142,7 @@ def test_the_sweep_goes_as_far_to_either_side_and_ends() -> None:
 @pytest.mark.parametrize(("side", "sign"), [("left", 1.0), ("right", -1.0)])
 def test_where_one_wall_alone_holds_the_tip_that_one_is_looked_for(side: str, sign: float) -> None:
     settings = Following.model_validate({"side": side})
-    search = SweepSearch(settings, ModelPrior(40e-3, noise=(1e-9, 1e-9), two_walls=False))
-    fed(search, 10, 0.0, 0.0)
-    fed(search, 3, 0.0, PRELOAD)
+    prior = ModelPrior(40e-3, noise=(1e-9, 1e-9), two_walls=False)
+    search = fed(rested(prior, settings=settings), 3, 0.0, PRELOAD)
     assert search.step(0.0) == pytest.approx(sign * REACH)
     assert search.step(sign * REACH) == 0.0 and search.over
-
-
-def test_on_a_face_without_friction_a_wall_is_felt_beyond_half_of_what_the_tip_probes_by() -> None:
-    settings = Following.model_validate({"friction": 0.0})
-    assert QUIET.sliding(settings) == 0.0
-    for share, found in ((0.48, False), (0.52, True), (-0.48, False), (-0.52, True)):
-        search = SweepSearch(settings, QUIET)
-        fed(search, 10, 0.0, 0.0)
-        fed(search, 3, 0.0, PRELOAD)
-        assert fed(search, 15, share * settings.probe, PRELOAD).found == found

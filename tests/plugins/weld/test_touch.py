@@ -9,9 +9,7 @@ import pytest
 
 from flangeye.devices import DeviceError
 from flangeye.errors import StageError
-from flangeye.files.paths import bundled
 from flangeye.models.finger import Finger
-from flangeye.models.model import read_model
 from flangeye.types import Image
 from flangeye_emulators.finger.sensor import FingerCamera, typical_compliance
 from flangeye_plugins.sensor import (
@@ -22,11 +20,10 @@ from flangeye_plugins.sensor import (
     sensor_mcap,
     sensor_opencv,
 )
-from flangeye_plugins.weld.touch.calibration import HeldReading, calibrate
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 from flangeye_plugins.weld.touch.tip_displacement import Interpreter
+from tests.plugins.weld.cell import FINGER
 
-FINGER = read_model(bundled("data") / "fingers" / "srm.yaml", Finger)
 COMPLIANCE = typical_compliance()
 
 
@@ -101,33 +98,6 @@ def test_a_tag_that_does_not_exist(tag: dict[str, Any], told: str) -> None:
 
 
 # --- calibration ----------------------------------------------------------------------------------
-
-
-def places():
-    for axis in range(3):
-        for way in (-1.0, -0.5, 0.5, 1.0):
-            yield np.eye(3)[axis] * way * 2e-3
-
-
-def readings(eye, force=None):
-    rest = [r for _ in range(20) if (r := eye.reading(np.zeros(3)))]
-    held = [
-        HeldReading(r, place, None if force is None else force * -place)
-        for place in places()
-        for _ in range(3)
-        if (r := eye.reading(place))
-    ]
-    return rest, held
-
-
-def test_the_calibration_finds_rest_gain_noise_and_stiffness() -> None:
-    rest, held = readings(Eye(), np.array([1000.0, 1000.0, 2000.0]))
-    found = calibrate(rest, held, "a test")
-    np.testing.assert_allclose(found.rest[:2], COMPLIANCE.rest[:2], atol=20e-6)
-    all_of_it = np.array(found.gain) @ COMPLIANCE.camera_R_tool @ np.diag(COMPLIANCE.share)
-    np.testing.assert_allclose(all_of_it, np.eye(3), atol=0.02)
-    assert max(found.noise[:2]) < 20e-6
-    assert (found.lateral, found.axial) == pytest.approx((1000.0, 2000.0))
 
 
 def test_a_finger_that_was_never_calibrated() -> None:
