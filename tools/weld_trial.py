@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,57 +14,25 @@ from flangeye_emulators.weld_world.world import ArmResponse, ImageQueue, Nominal
 from flangeye_plugins.weld.following.follower import Follower
 
 
-class Row(NamedTuple):
-    """One cycle; lengths [m], angles [rad], times [s], all but ``advance`` and ``bound`` true.
-
-    Attributes:
-        time: Time [s].
-        torch_s: Arc length of the torch on the true seam.
-        torch: Offset of the torch to the left of the seam.
-        tip_s: Arc length of the tip on the true seam.
-        tip: Offset of the tip to the left of the seam.
-        robot: Offset of the reported end point to the left of the seam.
-        turn: Commanded angular velocity.
-        advance: Progress of the tip by the controller.
-        bound: The controller's bound of the torch's error.
-        band: The controller's bound that holds for 95 % of the seam.
-        aim: Target of the torch, to the left of the seam.
-        arc_on: 1 once the torch was within ``max_error`` and could weld; 0 before.
-    """
-
-    time: float
-    torch_s: float
-    torch: float
-    tip_s: float
-    tip: float
-    robot: float
-    turn: float
-    advance: float
-    bound: float
-    band: float
-    aim: float
-    arc_on: float
-
-
 @dataclass(frozen=True, eq=False)
 class Trial:
     """What happened.
 
     Attributes:
         controller: As it ended.
-        rows: (K, 12) columns as :class:`Row` has them.
+        rows: K cycles as :func:`_row` has them.
         phases: K names.
         length: Length of the true seam [m].
     """
 
     controller: Controller
-    rows: Floats
+    rows: list[dict[str, float]]
     phases: tuple[str, ...]
     length: float
 
     def column(self, name: str) -> Floats:
-        """Return a column (K,) by its name in :class:`Row`."""
-        return np.asarray(self.rows[:, Row._fields.index(name)])
+        """Return a number of all cycles (K,) by its name."""
+        return np.array([row[name] for row in self.rows], dtype=np.float64)
 
     @property
     def beside(self) -> Floats:
@@ -136,7 +103,7 @@ def run_trial(
     look = (
         None if start.look is None else BeadProfiler(start.look, np.random.default_rng([seed, 2]))
     )
-    rows: list[Row] = []
+    rows: list[dict[str, float]] = []
     phases: list[str] = []
     while arm.pose.time < start.longest and controller.phase not in ("done", "stopped"):
         age = arm.pose.time - pose.time
@@ -152,16 +119,29 @@ def run_trial(
         rows.append(_row(world, arm.pose, controller, command))
         phases.append(controller.phase)
         arm.go(command)
-    return Trial(controller, np.array(rows), tuple(phases), world.groove.root.length)
+    return Trial(controller, rows, tuple(phases), world.groove.root.length)
 
 
-def _row(world: WeldWorld, pose: ToolPose, controller: Controller, command: Command) -> Row:
+def _row(
+    world: WeldWorld, pose: ToolPose, controller: Controller, command: Command
+) -> dict[str, float]:
+    """Return one cycle; lengths [m], angles [rad], times [s]. Offsets are to the seam's left."""
     root, s = world.groove.root, world.contact.s
     place = root.at(s)
-    tip = float((world.tip[:2] - place.point) @ place.normal)
-    robot = float((pose.position[:2] - place.point) @ place.normal)
-    return Row(
-        pose.time, world.torch_s, world.off, s, tip, robot, command.turn, controller.tip,
-        controller.bound, controller.band, getattr(controller, "aim", 0.0),
-        getattr(controller, "arc_from", 0.0) is not None,
-    )  # fmt: skip
+    return {
+        "time": pose.time,
+        # Arc lengths on the true seam, and true offsets, of torch, tip and reported end point
+        "torch_s": world.torch_s,
+        "torch": world.off,
+        "tip_s": s,
+        "tip": float((world.tip[:2] - place.point) @ place.normal),
+        "robot": float((pose.position[:2] - place.point) @ place.normal),
+        # What the controller commands, and states: the tip's progress, the torch's bound, the bound
+        # that holds for 95 % of the seam, its target, and 1 once the torch could weld
+        "turn": command.turn,
+        "advance": controller.tip,
+        "bound": controller.bound,
+        "band": controller.band,
+        "aim": getattr(controller, "aim", 0.0),
+        "arc_on": getattr(controller, "arc_from", 0.0) is not None,
+    }

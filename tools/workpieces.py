@@ -179,14 +179,8 @@ def _together(first: Mesh, second: Mesh) -> Mesh:
 
 def _fillet() -> str:
     (start, _, root), (end, _, _) = T_JOINT[1]
-    leg = T_JOINT[1][1][2] - root
-    seam = {
-        "name": "fillet",
-        "points": [[1e3 * x, 0.0, 1e3 * root] for x in (start, end)],
-        "opening": [0, -1, 1],
-        "half_angle": "45 deg",
-        "half_width": f"{1e3 * leg * np.sin(np.pi / 4):.6g} mm",
-    }
+    points = np.array([[start, 0.0, root], [end, 0.0, root]])
+    seam = _seam("fillet", points, [0, -1, 1], np.pi / 4, T_JOINT[1][1][2] - root)
     return _yaml("T-joint of two plates of 10 mm", "fillet", seam)
 
 
@@ -236,18 +230,9 @@ def pipe_on_plate() -> Mesh:
 def _pipe() -> str:
     points = _circle(FOOT[1][2])
     outwards = points / RING + [0.0, 0.0, 1.0 - FOOT[1][2] / RING]
-    seam = {
-        "name": "fillet",
-        "points": _in_mm(points),
-        "opening": [[round(float(v), 6) for v in way] for way in outwards],
-        "half_angle": "45 deg",
-        "half_width": f"{1e3 * PIPE[1] * np.sin(np.pi / 4):.6g} mm",
-    }
+    opening = [[round(float(v), 6) for v in way] for way in outwards]
+    seam = _seam("fillet", points, opening, np.pi / 4, PIPE[1])
     return _yaml("Pipe of 120 mm on a plate of 10 mm", "pipe-on-plate", seam)
-
-
-def _in_mm(points: Floats) -> list[list[float]]:
-    return [[round(float(1e3 * v), 6) for v in point] for point in points]
 
 
 def write_stl(path: Path, mesh: Mesh) -> None:
@@ -267,12 +252,19 @@ def _description(plate: Plate) -> str:
 
 
 def _groove(points: Floats) -> dict[str, Any]:
+    return _seam("groove", points, [0, 0, 1], HALF_ANGLE, DEPTH / np.cos(HALF_ANGLE))
+
+
+def _seam(
+    name: str, points: Floats, opening: list[Any], half_angle: float, wall: float
+) -> dict[str, Any]:
+    """Return a seam between two walls of a length [m], each at an angle to the opening [rad]."""
     return {
-        "name": "groove",
-        "points": _in_mm(points),
-        "opening": [0, 0, 1],
-        "half_angle": f"{np.degrees(HALF_ANGLE):.6g} deg",
-        "half_width": f"{1e3 * DEPTH * np.tan(HALF_ANGLE):.6g} mm",
+        "name": name,
+        "points": [[round(float(1e3 * v), 6) for v in point] for point in points],
+        "opening": opening,
+        "half_angle": f"{np.degrees(half_angle):.6g} deg",
+        "half_width": f"{1e3 * wall * np.sin(half_angle):.6g} mm",
     }
 
 

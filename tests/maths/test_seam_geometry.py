@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from flangeye import types as t
-from flangeye.maths.seam_geometry import distances_to_line, seam_frames, tube_radii, tube_rings
+from flangeye.maths.seam_geometry import (
+    distances_to_line,
+    seam_frames,
+    torch_deviation,
+    tube_radii,
+    tube_rings,
+)
 from flangeye.workflow.log.read import _messages, read_run
 from flangeye.workflow.log.record import Recorder
 
@@ -78,3 +84,10 @@ def test_the_distance_from_a_line_is_that_from_its_nearest_piece() -> None:
     line = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
     points = np.array([[0.5, 0, 0.2], [2, 0.5, 0], [-3, 0, 4]])
     assert distances_to_line(points, line) == pytest.approx([0.2, 1.0, 5.0])
+
+
+def test_the_torch_is_measured_across_the_opening_and_only_beside_the_seam() -> None:
+    line = np.array([[0.0, 0, 0], [0.1, 0, 0]])
+    points = np.array([[-0.01, 0, 0], [0.05, 2e-3, 7e-3], [0.2, 0, 0]])
+    found = torch_deviation(points, line, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(found, [2e-3])

@@ -82,7 +82,9 @@ class WeldWorld:
         """
         rng = np.random.default_rng(seed)
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
-        self.contact = TipContact(self.groove, _true_tip(nominal.tip, truth))
+        tip, finger = nominal.tip, truth.finger
+        stiff = tip.lateral * finger.lateral, tip.axial * finger.axial
+        self.contact = TipContact(self.groove, Tip(tip.radius, *stiff, finger.friction))
         self._arm = ArmError(truth.arm, rng)
         self._tool, self._stands = TrueTool(truth.tool, nominal.torch), nominal.level_R_tool
         self._finger = TrueFinger(truth.finger)
@@ -118,11 +120,6 @@ class WeldWorld:
         moved = self._heat.at(self.contact.s, self.torch_s)
         self.tip = self.contact.settle(rest, moved, axes)
         return self._finger.shown(pose.time, axes.T @ (self.tip - rest))
-
-
-def _true_tip(tip: Tip, truth: WeldTruth) -> Tip:
-    finger = truth.finger
-    return Tip(tip.radius, tip.lateral * finger.lateral, tip.axial * finger.axial, finger.friction)
 
 
 class SeamDistortion:

@@ -11,7 +11,6 @@ import multiprocessing
 import queue
 import signal
 import threading
-from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
 from typing import Any, Self, TypeVar
@@ -53,11 +52,11 @@ class CameraProcess:
         """Return the measurements since the last call; raise DeviceError if the camera is lost."""
         if self._error is not None:
             raise self._error
-        return list(_emptied(self._sights))
+        return _emptied(self._sights)
 
     def profiles(self) -> list[WeldProfile]:
         """Return the bead profiles since the last call."""
-        return list(_emptied(self._profiles))
+        return _emptied(self._profiles)
 
     def tell(self, state: RobotState) -> None:
         """Store the arm's newest state, which the thread passes to the camera process."""
@@ -138,9 +137,8 @@ class CameraProcess:
             self._process.join()
 
 
-def _emptied(items: queue.SimpleQueue[Item]) -> Iterator[Item]:
-    while not items.empty():
-        yield items.get()
+def _emptied(items: queue.SimpleQueue[Item]) -> list[Item]:
+    return [items.get() for _ in range(items.qsize())]
 
 
 def camera_process(wire: Connection, job: CameraJob) -> None:

@@ -16,7 +16,7 @@ from flangeye.errors import StageError
 from flangeye.models.finger import Finger
 from flangeye.motion.arc import OFF
 from flangeye.motion.executor import Executor
-from flangeye.motion.seam_following import Command, Controller, ToolPose
+from flangeye.motion.seam_following import Controller, ToolPose
 from flangeye.types import Floats
 from flangeye_plugins.weld.camera_process import FingerCameraReader
 from flangeye_plugins.weld.following.follower import Follower
@@ -248,22 +248,11 @@ def _turn(
         twist = np.append(twist, arc)
     cell.drive.robot.move_velocity(twist, cell.drive.limits.acceleration)
     took = (clock.computing, clock.period, clock.answering)
-    weld_log.turned(cycle_of(pose, used, command, controller, arc, took))
-
-
-def cycle_of(
-    pose: ToolPose,
-    used: tuple[int, ...],
-    command: Command,
-    controller: Controller,
-    arc: float,
-    took: tuple[float, float, float],
-) -> Cycle:
-    """Return the log record of a cycle."""
     x, y, z = pose.position.tolist()
     vx, vy, vz = command.velocity.tolist()
-    return Cycle(
+    cycle = Cycle(
         pose.time, (x, y, z), pose.angle, used, (vx, vy, vz), command.turn, controller.phase,
         controller.tip, controller.torch, controller.wanted, controller.sigma, controller.bound,
         controller.band, arc, *took,
     )  # fmt: skip
+    weld_log.turned(cycle)

@@ -7,7 +7,7 @@ displacements. So nothing has to be saved when a weld stops, even if the process
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -61,21 +61,17 @@ def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
     return part.bind(part.params.model_validate(given, context=lookup) if part.params else None)
 
 
-def take_profiles(controller: Controller, looks: Sequence[WeldProfile]) -> None:
-    """Pass new bead profiles to a controller, if it follows by touch."""
-    follower = follower_of(controller)
-    if follower is not None:
-        for profile in looks:
-            follower.looked(profile)
-
-
 def controller_from(start: Mapping[str, Any]) -> Controller:
     """Return the controller of a logged weld, in its initial state."""
     tuples = {name: tuple(start["prior"][name]) for name in ("noise", "arc")}
     prior = ModelPrior(**{**start["prior"], **tuples})
     settings = Following.model_validate(start["settings"])
     plan, kept = Path(np.array(start["points"]), start["wraps"]), start.get("kept")
-    before = None if kept is None else _kept_from(kept)
+    before = None
+    if kept is not None:
+        samples, traced = np.array(kept["samples"]), np.array(kept["traced"]).reshape(-1, 3)
+        learned = SweepFit(**kept["learned"])
+        before = ResumePoint(samples, kept["torch"], learned, traced, kept["number"])
     given = start.get("start")
     at = None if given is None else WeldStart(**given)
     task = WeldTask(plan, prior, settings, before=before, given=at)
@@ -85,12 +81,6 @@ def controller_from(start: Mapping[str, Any]) -> Controller:
 def kept_value(kept: ResumePoint) -> dict[str, Any]:
     """Return the state of a stopped weld as plain values for the log."""
     return {**asdict(kept), "samples": kept.samples.tolist(), "traced": kept.traced.tolist()}
-
-
-def _kept_from(value: Mapping[str, Any]) -> ResumePoint:
-    samples, traced = np.array(value["samples"]), np.array(value["traced"]).reshape(-1, 3)
-    learned = SweepFit(**value["learned"])
-    return ResumePoint(samples, value["torch"], learned, traced, value["number"])
 
 
 def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
@@ -160,7 +150,9 @@ class LoggedWeld:
     def _decide(self, cycles: Mapping[str, list[Any]]) -> None:
         for i, time in enumerate(cycles["time"]):
             pose = ToolPose(time, np.array(cycles["position"][i]), cycles["angle"][i])
-            take_profiles(self.controller, self._profiles.pop(self.cycles, []))
+            if (follower := follower_of(self.controller)) is not None:
+                for profile in self._profiles.pop(self.cycles, []):
+                    follower.looked(profile)
             self.cycles += 1
             felt = [self.felt[number] for number in cycles["touches"][i]]
             command = self.controller.step(pose, [touch for touch in felt if touch is not None])

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flangeye.errors import RecipeError
 from flangeye.files.paths import bundled
 from flangeye.models.model import read_model
 from flangeye.motion.seam_following import Command, ToolPose
-from flangeye_emulators.weld_world.groove import Gap, Groove, Tip, TipContact
+from flangeye_emulators.weld_world.groove import Gap, Groove, GrooveSection, Tip, TipContact
 from flangeye_emulators.weld_world.truth import (
     ArmTruth,
     ClockTruth,
@@ -183,3 +185,44 @@ def test_a_world_is_a_file_of_its_own(tmp_path) -> None:
         own.write_text(wrong)
         with pytest.raises(RecipeError, match=told):
             read_model(own, WeldTruth)
+
+
+NARROW = GrooveSection(np.pi / 6, 8e-3)
+SEAT = 1.5e-3 / np.sin(np.pi / 6)
+
+
+def energy(tip, position, rest):
+    off = position - rest
+    return tip.lateral * off[1] ** 2 + tip.axial * off[2] ** 2
+
+
+@given(st.floats(-3e-3, 3e-3), st.floats(-3e-3, 4e-3))
+def test_the_tip_takes_the_place_of_least_energy_between_the_walls(
+    across: float, up: float
+) -> None:
+    tip = Tip(friction=0.0)
+    contact = TipContact(Groove(Path(LINE), NARROW), tip)
+    rest = np.array([0.06, across, SEAT + up])
+    found = contact.settle(rest)
+    y = np.linspace(-5e-3, 5e-3, 2001)
+    floor = SEAT + np.abs(y) / np.tan(NARROW.half_angle)
+    height = np.maximum(floor, rest[2])
+    least = (tip.lateral * (y - rest[1]) ** 2 + tip.axial * (height - rest[2]) ** 2).min()
+    assert found[2] >= SEAT + abs(found[1]) / np.tan(NARROW.half_angle) - 1e-9
+    assert energy(tip, found, rest) <= least + 1e-9
+
+
+def test_the_tip_lags_by_friction_and_no_more() -> None:
+    tip = Tip(friction=0.1)
+    contact = TipContact(Groove(Path(LINE), NARROW), tip)
+    for x in np.arange(0.02, 0.03, 1e-4):
+        found = contact.settle(np.array([x, 1e-3, SEAT - 1e-3]))
+    normal = np.hypot(tip.lateral * 1e-3, tip.axial * 1e-3)
+    assert x - found[0] == pytest.approx(0.1 * normal / tip.lateral, rel=1e-6)
+
+
+def test_outside_the_workpiece_and_on_its_face_the_tip_is_free() -> None:
+    contact = TipContact(Groove(Path(LINE), NARROW), Tip())
+    np.testing.assert_array_equal(contact.settle(np.array([-0.01, 0, 0.0])), [-0.01, 0, 0])
+    on_top = contact.settle(np.array([0.05, 8e-3, 5e-3]))
+    np.testing.assert_allclose(on_top[1:], [8e-3, 8e-3 + 1.5e-3], atol=1e-9)

@@ -17,19 +17,7 @@ def line_of(path, unit="mm", **given):
 
 def dxf(folder, *entities, header=""):
     """Write a drawing of (name, code, value, code, value, …) entities."""
-    rows = [
-        "0",
-        "SECTION",
-        "2",
-        "HEADER",
-        *header.split(),
-        "0",
-        "ENDSEC",
-        "0",
-        "SECTION",
-        "2",
-        "ENTITIES",
-    ]
+    rows = f"0 SECTION 2 HEADER {header} 0 ENDSEC 0 SECTION 2 ENTITIES".split()
     for name, *groups in entities:
         rows += ["0", name, *map(str, groups)]
     path = folder / "part.dxf"

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from flangeye.models.finger import Finger
-from flangeye.motion.seam_following import STILL
+from flangeye.motion.seam_following import STILL, Command
 from flangeye.types import BASE, FLANGE, Transform
 from flangeye.types.geometry import rigid, rotation_exp
 from flangeye_plugins.weld.frame import Tool, WorkSurface, body_from
+from tests.plugins.weld import cell
 from tools.weld_bench import FINGER
 
 TURN = rotation_exp(np.array([0.2, -0.1, 0.5]))
@@ -91,3 +94,26 @@ def test_a_tool_that_stands_askew_is_brought_upright_within_a_second() -> None:
     assert twist[3:] == pytest.approx(-np.sin(0.1) * axis)
     at_tip = twist[:3] + np.cross(twist[3:], tip - there.translation)
     assert at_tip == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+@given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-0.3, 0.3))
+def test_the_flange_moves_as_the_tip_is_told(angle: float, yaw: float, turn: float) -> None:
+    base_T_plane = rigid(rotation_exp(np.array([0.1, -0.2, yaw])), np.array([0.5, 0.1, 0.2]))
+    points = np.array([[0.0, 0, 0], [0.1, 0, 0]]) @ base_T_plane[:3, :3].T + base_T_plane[:3, 3]
+    surface = WorkSurface(points, np.tile(base_T_plane[:3, 2], (2, 1)))
+    finger = cell.FINGER.model_copy(update={"tip": (0.03, -0.01, 0.18), "direction": 0.7})
+    tool = Tool(finger, surface)
+    flange = tool.base_T_flange(np.array([0.01, 0.02, 0.03]), angle, 0.05)
+    assert tool.up(flange.rotation) == pytest.approx(base_T_plane[:3, 2])
+    before = tool.pose(flange, 0.0)
+    np.testing.assert_allclose(before.position, [0.01, 0.02, 0.03], atol=1e-12)
+    step = 1e-5
+    twist = tool.twist(Command(np.array([5e-3, -2e-3, 1e-3]), turn), flange)
+    moved = rigid(
+        rotation_exp(twist[3:] * step) @ flange.rotation, flange.translation + twist[:3] * step
+    )
+    after = tool.pose(Transform("base", "flange", moved), step)
+    np.testing.assert_allclose(
+        (after.position - before.position) / step, [5e-3, -2e-3, 1e-3], atol=1e-5
+    )
+    assert (after.angle - before.angle) / step == pytest.approx(turn, abs=1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye_plugins.weld.path import Path
-from tests.plugins.weld.bench import circle
+from tests.plugins.weld.bench import circle, straight
 
 CORNER = Path(np.array([[0.0, 0.0, 0.0], [0.03, 0.04, 0.002], [0.03, 0.08, 0.002]]))
 """50 mm that climb by 2, then 40 mm that do not."""
@@ -86,3 +86,23 @@ def test_at_its_very_end_a_path_is_at_its_last_point_and_climbs_as_it_does_there
     assert points[0] == pytest.approx(path.points[-1], abs=1e-12)
     rise = float(path.points[-1, 2] - path.points[-2, 2])
     assert path.climb(path.length) == pytest.approx(rise / path.step, abs=1e-3)
+
+
+def test_progress_neither_goes_back_nor_jumps_to_another_branch() -> None:
+    eight = Path(
+        np.column_stack([np.sin(t := np.linspace(0, 2 * np.pi, 800)), np.sin(2 * t) / 2, 0 * t])
+        * 0.1
+    )
+    s, crossings = 0.0, []
+    for ahead in np.arange(0.0, eight.length, 1e-3):
+        at = eight.at(float(ahead)).point
+        before, s = s, eight.advance(at, s, 5e-3)
+        assert before <= s <= before + 5e-3
+        crossings.append(abs(s - ahead))
+    assert max(crossings) < 1e-3
+    assert eight.advance(eight.at(0.0).point, s, 5e-3) >= s
+
+
+def test_the_curvature_of_a_path_is_not_its_scatter_s() -> None:
+    scatter = straight() + 0.02e-3 * np.random.default_rng(0).standard_normal((200, 3))
+    assert Path(scatter).sharpest(0.0, 0.12) < 5.0

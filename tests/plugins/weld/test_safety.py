@@ -8,16 +8,12 @@ import pytest
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.errors import StageError
-from flangeye.motion.executor import Executor
 from flangeye.motion.seam_following import ToolPose
 from flangeye_emulators.robot import SimulatedRobot, SimulatedRobotParams
 from flangeye_plugins.weld.execution import Bounds
-from flangeye_plugins.weld.finger_camera import LatestState
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.settings import Following
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
-from tests.motion.stand_in import LIMITS, StandIn
-from tests.motion.stand_in import MODEL as STAND_IN
 from tests.plugins.weld.cell import FINGER, HOME, MODEL, planned, run
 
 SHORT = 0.05
@@ -191,16 +187,3 @@ def test_a_tip_keeps_to_the_plan_and_to_what_its_finger_stands(
     with pytest.raises(DeviceError) as error:
         bounds.check(pose, 0.05, [felt])
     assert str(error.value) == told
-
-
-def test_an_arm_that_moves_unasked_is_stopped() -> None:
-    robot = StandIn()
-    drive = Executor(robot, STAND_IN, LIMITS, LatestState(robot.state()).tell)
-    for _ in range(5):
-        drive.tick()
-    robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
-    with pytest.raises(DeviceError, match="the arm moves without a command of flangeye"):
-        for _ in range(3000):
-            robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
-            drive.tick()
-    assert "stop" in robot.commands()

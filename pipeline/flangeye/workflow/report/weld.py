@@ -90,18 +90,22 @@ def _summary(facts: Facts, weld: WeldReport) -> str:
     return text if weld.completed else f"{text} It was stopped: {weld.reason}."
 
 
-def _paths(weld: WeldReport, plane: WeldPlane) -> Figure:
-    named: tuple[tuple[str, Floats, str, dict[str, Any]], ...] = (
-        ("planned", weld.planned, SERIES["held_out"], {"dash": "dot"}),
-        ("felt (refined)", weld.refined, SERIES["truth"], {}),
-        ("robot", weld.robot, SERIES["unused"], {}),
-        ("tip", weld.tip, SERIES["used"], {}),
-        ("torch", weld.torch, SERIES["circle"], {}),
+def _measured(weld: WeldReport) -> tuple[tuple[str, Floats, str], ...]:
+    """Return the names, places (N, 3) and colours of what was measured."""
+    return (
+        ("felt (refined)", weld.refined, SERIES["truth"]),
+        ("robot", weld.robot, SERIES["unused"]),
+        ("tip", weld.tip, SERIES["used"]),
+        ("torch", weld.torch, SERIES["circle"]),
     )
-    traces = []
-    for name, places, colour, rest in named:
-        at = plane.flat(places) * 1e3
-        traces.append(curve(at[:, 0], at[:, 1], name, colour, **rest))
+
+
+def _paths(weld: WeldReport, plane: WeldPlane) -> Figure:
+    x, y = plane.flat(weld.planned).T * 1e3
+    traces = [curve(x, y, "planned", SERIES["held_out"], dash="dot")]
+    for name, places, colour in _measured(weld):
+        x, y = plane.flat(places).T * 1e3
+        traces.append(curve(x, y, name, colour))
     layout = layout2d("along the seam [mm]", "across [mm]")
     layout["yaxis"]["scaleanchor"] = "x"
     return {"data": traces, "layout": layout}
@@ -109,16 +113,10 @@ def _paths(weld: WeldReport, plane: WeldPlane) -> Figure:
 
 def _offsets(weld: WeldReport, plane: WeldPlane) -> Figure:
     traces = []
-    for name, places, colour in (
-        ("felt (refined)", weld.refined, SERIES["truth"]),
-        ("tip", weld.tip, SERIES["used"]),
-        ("torch", weld.torch, SERIES["circle"]),
-        ("robot", weld.robot, SERIES["unused"]),
-    ):
-        along, across = (
-            plane.beside(weld.planned, places) if len(places) else (np.zeros(0), np.zeros(0))
-        )
-        traces.append(curve(along * 1e3, across * 1e3, name, colour))
+    for name, places, colour in _measured(weld):
+        beside = plane.beside(weld.planned, places) if len(places) else np.zeros((2, 0))
+        along, across = np.multiply(beside, 1e3)
+        traces.append(curve(along, across, name, colour))
     layout = layout2d("along the plan [mm]", "left of the plan [mm]")
     return {"data": traces, "layout": layout}
 

@@ -63,11 +63,12 @@ def calibrate(rest: Sequence[TagReading], held: Sequence[HeldReading], source: s
         )
     # In the tip's coordinates: what a measurement of the seam will have.
     noise = np.std([gain @ (r.translation - place) for r in rest], axis=0)
+    turns = np.array([rotation_exp(r.rotation) for r in rest])
     lateral, axial = _stiffness(held)
     return Calibration.model_validate(
         {
             "rest": _si(place),
-            "rotation": _si(_mean_rotation([r.rotation for r in rest])),
+            "rotation": _si(rotation_log(nearest_rotation(turns.mean(axis=0)))),
             "gain": gain.tolist(),
             "noise": _si(noise),
             "lateral": lateral,
@@ -86,11 +87,6 @@ def _gain(tag: Floats, tip: Floats) -> Floats:
     # Row vectors: tip = tag @ gain.T
     solution, *_ = np.linalg.lstsq(tag, tip, rcond=None)
     return np.asarray(solution.T)
-
-
-def _mean_rotation(vectors: Sequence[Floats]) -> Floats:
-    matrices = np.array([rotation_exp(v) for v in vectors])
-    return rotation_log(nearest_rotation(matrices.mean(axis=0)))
 
 
 def _stiffness(held: Sequence[HeldReading]) -> tuple[SI | None, SI | None]:
