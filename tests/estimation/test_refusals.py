@@ -1,5 +1,6 @@
 """What is refused: each motion that is missing, each mistake of the person, by its name."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -244,6 +245,14 @@ def test_a_size_that_is_unknown_is_found(factor: float) -> None:
 def test_a_size_that_is_a_little_off_is_refused_and_what_finds_it_is_named() -> None:
     made = session(MARKER, np.random.default_rng(17), n=20)
     assert "target_size: unknown finds it" in refusal(resized(made, 2.0))
+
+
+def test_a_size_that_is_off_by_a_hundredth_is_told_as_well_as_it_is_known() -> None:
+    made = session(MARKER, np.random.default_rng(17), n=20)
+    told = refusal(resized(made, 1.01))
+    found = re.match(r"the arm's motion shows that the target is (\S+) \+- (\S+) times as", told)
+    assert found is not None
+    assert abs(float(found[1]) - 1 / 1.01) < 4 * float(found[2]) < 0.005
 
 
 def test_a_size_that_may_well_be_right_is_not_refused() -> None:

@@ -63,6 +63,17 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         "2.fit.toy", "fit.toy", "fit", "a",
     )  # fmt: skip
     assert np.array_equal(entry.value.centre, CIRCLE.centre)
+    assert log.given("fit.toy") is entry.value and log.given("solve.toy") is None
+
+
+@pytest.mark.parametrize("what", ["poses", "entries", "rejections"])
+def test_a_log_with_any_one_capture_value_or_rejection_has_gathered(what: str) -> None:
+    log = RunLog(Path("r.mcap"))
+    with pytest.raises(StageError, match=r"^r.mcap: the run ended early; no capture was recorded$"):
+        log.require_gathered()
+    some: Any = {"a": {}} if what == "poses" else ["a"]
+    assert replace(log, **{what: some}).gathered
+    replace(log, **{what: some}).require_gathered()
 
 
 def test_a_log_knows_its_recipe_its_last_joints_and_whether_its_scans_are_whole(
