@@ -110,6 +110,19 @@ def test_a_fault_stops_the_arm_and_says_whose() -> None:
     assert robot.commands() == ["stop"]
 
 
+def test_an_arm_that_moves_unasked_is_stopped() -> None:
+    robot = StandIn()
+    drive, _ = under_watch(robot)
+    for _ in range(5):
+        drive.tick()
+    robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
+    with pytest.raises(DeviceError, match="the arm moves without a command of flangeye"):
+        for _ in range(3000):
+            robot.move_velocity(np.array([0.02, 0, 0, 0, 0, 0]), 0.3)
+            drive.tick()
+    assert "stop" in robot.commands()
+
+
 def test_an_arm_that_is_lost_is_not_lost_twice() -> None:
     robot = StandIn()
     drive, _ = under_watch(robot)
