@@ -123,11 +123,29 @@ def init(
 
 
 def _of_folder(folder: Path, out: Path, questions: Questions, registry: Registry) -> Draft:
-    from flangeye.workflow.recipe.draft import draft_recipe, look, mounting_seen
+    from flangeye.workflow.recipe.draft import look
 
-    survey, given = look(folder), dict(questions.given)
+    survey = look(folder)
     for line in survey.lines():
         say(line)
+    if questions.prompt is not None:
+        # What the data decide is the default of each question, as it is the answer with --yes
+        alone = replace(questions, given=dict(questions.given), prompt=None, assumed=[])
+        with suppress(FlangeyeError):
+            _of_survey(survey, out, alone, registry)
+        questions.likely = alone.likely
+    return _of_survey(survey, out, questions, registry)
+
+
+def _of_survey(survey: FolderSurvey, out: Path, questions: Questions, registry: Registry) -> Draft:
+    """Return a draft from a folder's content; the scans answer what they can.
+
+    Raises:
+        FlangeyeError: An answer is missing or invalid, or the recordings cannot be read.
+    """
+    from flangeye.workflow.recipe.draft import draft_recipe, mounting_seen
+
+    given = dict(questions.given)
     draft = _drafted(survey, out, questions, registry)
     turned = {name: found for name, found in questions.likely.items() if name == "rotation"}
     if "acquire.images" in draft.text and given["camera"] is None and questions.prompt is None:
@@ -216,7 +234,7 @@ def _seen(
     """Return the first scans that show a drafted recipe's target; None if it does not run.
 
     Raises:
-        RecipeError: None shows it, and one is ``needed``.
+        RecipeError: No scan shows the target, and ``needed`` is set.
     """
     from flangeye.types import ArchivePath
     from flangeye.workflow.recipe.load import parse_recipe

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from flangeye.cli import commands
 from flangeye.files.clouds import read_cloud
 from tests.conftest import Call
 
@@ -99,6 +101,27 @@ def test_three_commands_lead_to_a_launch_file(
     launch = (tmp_path / "first" / "exports" / "camera.launch.py").read_text()
     x = float(re.findall(r"--x[\"', ]+(-?[\d.]+)", launch)[0])
     assert x == pytest.approx(0.6, abs=2e-3)  # where the simulator had the camera
+
+
+@pytest.mark.parametrize(
+    ("heading", "angles", "shown"),
+    [
+        ("x,y,z,rx,ry,rz", fixed, "[xyz]"),
+        ("x,y,z,rx,ry,rz", vectors, "[vector]"),
+        ("X;Y;Z;A;B;C", kuka, "[kuka]"),
+    ],
+    ids=["roll-pitch-yaw", "vector-in-degrees", "kuka"],
+)
+def test_a_person_is_offered_what_the_scans_decide(
+    heading: str, angles: Any, shown: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    record(tmp_path / "cell", heading, angles, "scan_{number:02d}.ply")
+    words = ["init", "cell", "--robot", "ur5", "--scanner", "phoxi-m", "--out", "cell.yaml"]
+    done = CliRunner().invoke(commands(), words, input="\n" * 8)
+    assert done.exit_code == 0, done.output
+    assert f"(--rotation) {shown}" in " ".join(done.output.split())
+    assert f"rotation: {shown[1:-1]}" in Path("cell.yaml").read_text()
 
 
 def test_a_wrong_convention_is_refused_with_the_right_one(

@@ -43,7 +43,7 @@ class Questions:
         prompt: Asks the user; None without a terminal.
         assumed: Lines on the defaults used, to print at the end.
         likely: Likely answers from the data with their evidence, by option.
-        mended: What corrects the target's poses, as ``reader.corrected`` takes it.
+        mended: Corrections of the target's poses, as ``reader.corrected`` takes it.
         open: Option of the question that neither data nor a person answered; empty without one.
         rivals: Rotation conventions among which scans should decide, if the assumed one is unsure.
     """
@@ -87,6 +87,7 @@ class Questions:
                 answer = default
             else:
                 asked = f"{question} ({known})" if known else question
+                asked += f"; by the data: {shown}" if shown else ""
                 answer = self._asked(flag, asked, default, example, check)
             self.given[flag] = answer
         return answer
