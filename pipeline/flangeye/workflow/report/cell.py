@@ -166,7 +166,7 @@ class FoundBody(NamedTuple):
 
     Attributes:
         name: Shown in messages and reports.
-        capture: Its id.
+        capture: Id of the capture.
         edges: (E, 2, 3) the ends of its edges in the camera [m].
     """
 

@@ -198,7 +198,7 @@ class ImageView:
         data: The picture as a data URI.
         box: Shown window (x, y, width, height) of the image [px].
         corners: Detected corners (x, y) [px].
-        misses: (x1, y1, x2, y2) of the line for each corner [px].
+        misses: Ends (x1, y1, x2, y2) of the line drawn for each corner [px].
         radius: Radius of the circles about the corners [px].
         summary: The figure's content in words.
     """

@@ -161,7 +161,7 @@ class TransformText:
         quaternion: (x, y, z, w).
         translation_std: (x, y, z) [mm], at ``about``.
         rotation_std: Standard deviations about the parent's x, y, z [deg].
-        about: (x, y, z) [mm].
+        about: Point (x, y, z) to which the standard deviations refer [mm].
     """
 
     name: str

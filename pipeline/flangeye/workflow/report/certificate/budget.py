@@ -116,7 +116,7 @@ class Budget:
     """Uncertainty budget of one point.
 
     Attributes:
-        point: (3,) in the parent frame [m].
+        point: (3,) point in the parent frame [m].
         contributions: The input quantities.
         correlation: (n, n) among them.
     """
