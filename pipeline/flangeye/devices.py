@@ -275,7 +275,7 @@ class TactileSensor(Device, Protocol):
 
     Attributes:
         name: Shown in messages and reports.
-        camera_matrix: (3, 3) [px].
+        camera_matrix: (3, 3) camera matrix [px].
         distortion: (k,) OpenCV's distortion coefficients; empty for none.
     """
 
@@ -409,7 +409,7 @@ class MotionAllowed:
 
 
 def load_sdk(module: str, driver: str, install: str) -> Any:
-    """Return the module ``module``.
+    """Import a maker's SDK and return its module.
 
     Args:
         module: Name of the module.

@@ -78,7 +78,7 @@ class AsPrinted:
         return Command(np.array([*velocity, self._sink(pose)]), float(np.clip(turn, -most, most)))
 
     def _servo(self, pose: ToolPose) -> Floats:
-        """Lines 22 to 27."""
+        """Return the tool's rotation by lines 22 to 27 of Algorithm 2."""
         task = self._task
         nearest = int(np.argmin(_distances(self._plan, pose.position[:2])))
         self.tip = nearest * self._task.step

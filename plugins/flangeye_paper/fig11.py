@@ -28,7 +28,7 @@ class Runs(NamedTuple):
 
     Attributes:
         poses: (K,) poses seen.
-        errors: (R, K, 6) of each run, mm and deg; NaN before the first finite cost.
+        errors: (R, K, 6) errors of each run, mm and deg; NaN before the first finite cost.
         others_rms: (R,) residual of the last answers on the poses outside their pools [mm].
     """
 

@@ -103,9 +103,9 @@ class IcpFit:
 
     Attributes:
         motion: (4, 4) that takes the source onto the target.
-        iterations: How many steps it took.
+        iterations: Number of steps.
         share: Share of the source's points that matched.
-        rms: Distance of the matched pairs.
+        rms: Root mean square distance of the matched pairs.
     """
 
     motion: Floats
@@ -120,8 +120,8 @@ def icp(
     """Return Open3D's point-to-plane ICP, started at the identity; None if too few points match.
 
     Args:
-        source: (N, 3).
-        target: (M, 3), in the same unit.
+        source: (N, 3) points to move.
+        target: (M, 3) points to register with, in the same unit.
         normals: (M, 3) normals of the target.
         distance: Pairs further apart do not match.
         stop: When it ends.

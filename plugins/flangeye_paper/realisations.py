@@ -48,7 +48,7 @@ class RealisationOutcome:
         error: (6,) x, y, z [m], roll, pitch, yaw [rad] in ``camera``, at its origin.
         at_centre: (3,) displacement at the workspace's centre, in ``camera`` [m].
         rms: Rms error over the workspace [m].
-        alone: The same of least squares on the poses that are not outliers [m].
+        alone: Error of least squares on the poses that are not outliers [m].
         bound: Cramér-Rao, see :func:`bound`.
     """
 

@@ -32,9 +32,9 @@ class Trials(NamedTuple):
         target: The seen target.
         pairs: Poses of each.
         narrow: Whether the poses covered a small range only.
-        errors: (N, 6) at the camera's origin, mm and deg.
+        errors: (N, 6) errors at the camera's origin, mm and deg.
         workspace: (N,) rms over the workspace [mm].
-        refused: How many gave no answer.
+        refused: Number of trials without an answer.
     """
 
     target: str

@@ -60,7 +60,7 @@ def read_sessions(batch: Path) -> list[SessionRow]:
     """Return the sessions of a batch in the order of its table.
 
     Raises:
-        FlangeyeError: The folder is none of ``flangeye batch``.
+        FlangeyeError: The folder was not written by ``flangeye batch``.
     """
     table = batch / "sessions.csv"
     try:

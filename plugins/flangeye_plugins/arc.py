@@ -138,7 +138,7 @@ class UrDigitalArc(Device):
         self.gas(False)
 
     def _negotiate(self) -> None:
-        """Agree on what is sent: the inputs' bits one way, the outputs' the other."""
+        """Set up RTDE: receive the bits of the digital inputs, send those of the outputs."""
         # Of RTDE
         self._asked("V", struct.pack(">H", 2))
         # Packages in a second [Hz]: what every generation of controller can send
@@ -175,7 +175,7 @@ class UrDigitalArc(Device):
             raise DeviceError(f"{self.name}: {error}") from None
 
     def _read(self) -> None:
-        """Take in what has arrived; never waits."""
+        """Read the packages that have arrived, without waiting; store the newest inputs."""
         self._receive(0.0)
         for kind, body in self._packages():
             if kind == "U":

@@ -57,7 +57,7 @@ class TcpProfiler(Device):
 
     Attributes:
         name: Shown in messages and reports.
-        behind: How far behind the torch it looks [m].
+        behind: Distance of the profile behind the torch [m].
     """
 
     def __init__(self, params: TcpParams) -> None:

@@ -103,7 +103,7 @@ def compensated(base_T_camera: Transform, error: PoseError, rotation: bool = Tru
 
     Args:
         base_T_camera: The answer it was measured of.
-        error: What takes measured onto predicted points, in ``camera``.
+        error: Motion in ``camera`` from measured to predicted points.
         rotation: Whether its rotation counts; else only what it does where the flange was.
     """
     motion = error.motion if rotation else rigid(np.eye(3), error.displacement())
@@ -211,8 +211,8 @@ def _identifiability(told: ArmParameters, session: Session) -> str:
             f"and {combined} of them{one}"
         )
     return (
-        f"the poses identify none of the arm's {count} parameters singly{one}, and {combined} of "
-        "them: the correction is valid at similar poses, and gives no value for any single joint"
+        f"the poses identify {combined} of the arm's {count} parameters, and none singly{one}: the "
+        "correction is valid at similar poses, and gives no value for any single joint"
     )
 
 

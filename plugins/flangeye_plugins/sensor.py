@@ -39,7 +39,7 @@ class OpenCVCamera(Device):
 
     Attributes:
         name: Shown in messages and reports.
-        camera_matrix: (3, 3) [px].
+        camera_matrix: (3, 3) camera matrix [px].
         distortion: (k,) OpenCV's distortion coefficients.
     """
 
@@ -148,7 +148,7 @@ class RecordedImages(Device):
 
     Attributes:
         name: Shown in messages and reports.
-        camera_matrix: (3, 3) [px].
+        camera_matrix: (3, 3) camera matrix [px].
         distortion: (k,) OpenCV's distortion coefficients.
     """
 

@@ -138,18 +138,18 @@ def test_motions_of_half_a_turn_alone_are_refused() -> None:
     [
         (
             "park_martin", "eye-in-hand, base circle", "normal",
-            "solve.park_martin: needs whole poses of a marker, and there are circles: use "
+            "solve.park_martin: needs a marker's full poses, but these are circles: use "
             "solve.linear or solve.robust",
         ),
         (
             "shah", "eye-in-hand, base circle", "pose",
             "solve.shah: has two unknowns, and the configuration leaves one: write place: unknown "
-            "for a marker on or before one arm, or use solve.robust",
+            "for a marker on or in front of one arm, or use solve.robust",
         ),
         (
             "tsai_lenz", "two arms, marker", "pose",
             "solve.tsai_lenz: has two unknowns, and the configuration leaves three: write place: "
-            "unknown for a marker on or before one arm, or use solve.robust",
+            "unknown for a marker on or in front of one arm, or use solve.robust",
         ),
         (
             "kronecker", "eye-in-hand, marker", "pose",

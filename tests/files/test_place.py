@@ -47,5 +47,5 @@ def test_a_store_that_cannot_be_reached_is_one_line(
 ) -> None:
     with pytest.raises(StageError, match=r"^s3://nobody-s/a: cannot be reached: .*$"):
         storage_at("s3://nobody-s").write("a", b"")
-    with pytest.raises(StageError, match=r"no ftp:// is read; known: s3://, "):
+    with pytest.raises(StageError, match=r"ftp:// is not supported; known: s3://, "):
         storage_at("ftp://host/a")

@@ -110,9 +110,9 @@ def test_results_are_sent_at_the_end_whatever_ended_the_run(bucket: Any) -> None
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("github://a:b@c/", "github://a:b@c/: no github:// is read; known: s3://, gs://, az://, "
+        ("github://a:b@c/", "github://a:b@c/: github:// is not supported; known: s3://, gs://, az://, "
          "https://, zip://"),
-        ("zip://x::reference://y", "zip://x::reference://y: no reference:// is read; known: s3://, "
+        ("zip://x::reference://y", "zip://x::reference://y: reference:// is not supported; known: s3://, "
          "gs://, az://, https://, zip://"),
         ("s3://cell/nothing", "s3://cell/nothing: holds nothing"),
     ],

@@ -222,12 +222,12 @@ def print_log(console: Console, log: RunLog) -> None:
 
 def _state(log: RunLog) -> str:
     if log.damage:
-        return "damaged: some of it cannot be read; shown as far as it goes"
+        return "damaged: part of the log cannot be read; the rest is shown"
     if log.complete:
         return "complete"
     if not log.gathered:
         return "incomplete: the run ended early; no capture was recorded"
-    return "incomplete: the run ended early; shown as far as it goes"
+    return "incomplete: the run ended early; what it recorded is shown"
 
 
 def _by_acquire_step(log: RunLog) -> dict[str, list[dict[str, Any]]]:

@@ -142,7 +142,7 @@ def most_informative_poses(
         session: The sightings so far.
         known: The arm's parameters as estimated from the session.
         candidates: Possible further sightings, with joint angles.
-        count: How many to choose.
+        count: Number of sightings to choose.
     """
     found = session.found
     columns, of_size = _columns(found, FLANGE)

@@ -160,7 +160,7 @@ def calibrate_at(
     distance from the most likely ones.
 
     Args:
-        places: (4, 4) of each unknown.
+        places: Pose (4, 4) of each unknown.
         observations: The sightings.
         cell: The graph of frames.
         scanner: The scanner's model, if it is known.

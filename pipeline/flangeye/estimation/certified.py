@@ -52,8 +52,8 @@ class CertifiedAnswer:
         frames: Frames by name; an unknown frame has no place, a moving frame one for each time.
         ends: (N,) camera and target of each sighting.
         times: (N,) index into the places of moving frames.
-        places: (4, 4) of the K unknown frames.
-        covariances: (6, 6) of these places.
+        places: Poses (4, 4) of the K unknown frames.
+        covariances: Covariances (6, 6) of these places.
         errors: (N, 6) twists from predicted to measured targets, in ``camera``.
         weights: (N, 6, 6) inverse covariances of the errors.
         freedoms: (N,) how many numbers were measured: 6 of a pose, 5 of a circle with its normal, 3

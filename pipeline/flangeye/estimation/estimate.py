@@ -37,7 +37,7 @@ class Estimate:
     Attributes:
         problem: The estimation problem.
         effects: The possible errors.
-        places: (4, 4) of each unknown at the posterior mean, the point of linearisation.
+        places: Pose (4, 4) of each unknown at the posterior mean, the point of linearisation.
         posterior: Posterior of the corrections to poses and effect parameters.
         inliers: (N,) which sightings took part.
         squares: (N,) squared Mahalanobis distance of each from the others' prediction, over its
@@ -129,7 +129,7 @@ def model_at(
 
     Args:
         problem: The estimation problem.
-        places: (4, 4) of each unknown.
+        places: Pose (4, 4) of each unknown.
         effects: The possible errors.
         shares: (N,) weights of the sightings.
         of_session: Whether the sightings are those of the session, and not new ones.
@@ -206,7 +206,7 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
 
     Args:
         problem: The estimation problem.
-        start: (4, 4) of each unknown, near the answer.
+        start: Pose (4, 4) of each unknown, near the answer.
         effects: The possible errors.
         agree: (N,) which sightings agree with the start.
     """

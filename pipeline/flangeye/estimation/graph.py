@@ -37,7 +37,7 @@ class Sightings:
         pairs: (N,) which camera saw which target, an index of ``Problem.ends``.
         rotations: (N, 3, 3) camera_R_target; the turn of a circle about z, and all rotation of a
             centre, has no meaning.
-        centres: (N, 3) in ``camera`` [m].
+        centres: (N, 3) measured centres in ``camera`` [m].
         covariances: (N, 6, 6) noise of the features, order (rotation, translation), in ``camera``.
         projectors: (N, 6, 6) onto the measured directions: rank 6 for a pose, 5 with a normal, 3
             for a centre.

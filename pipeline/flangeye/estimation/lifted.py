@@ -73,9 +73,9 @@ class LiftedSightings:
     """N sightings as equations: camera side equals target side.
 
     Attributes:
-        camera: Side that leads over the camera and the measured pose.
-        target: Side that leads to the target.
-        weights: (N, 6, 6) of squared errors, turns [1/rad^2] before shifts [1/m^2].
+        camera: Left side: the path to the camera, and the measured pose.
+        target: Right side: the path to the target.
+        weights: (N, 6, 6) weights of squared errors, turns [1/rad^2] before shifts [1/m^2].
         freedoms: (N,) how many numbers were measured: 6 of a pose, 5 of a circle with its normal
             (its z), 3 of a centre.
     """

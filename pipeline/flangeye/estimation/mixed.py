@@ -123,8 +123,8 @@ class Fit:
         right: (P + K,) right side of the normal equations.
         root: (P + K, P + K) lower Cholesky factor of the information with the effects' prior.
         cost: -2 log of the restricted likelihood, up to a constant.
-        gradient: (S,) of the cost by the logarithm of each size.
-        curvature: (S, S) of the cost by the same logarithms.
+        gradient: (S,) derivatives of the cost by the logarithm of each size.
+        curvature: (S, S) second derivatives of the cost by the same logarithms.
     """
 
     sizes: Floats

@@ -114,7 +114,7 @@ class Spread:
 
 
 def spread_of(points: Floats) -> Spread:
-    """Measure (N, 3) points."""
+    """Return how (N, 3) points are spread along their longest axis and about it."""
     centred = points - points.mean(axis=0)
     axis = np.linalg.svd(centred, full_matrices=False)[2][0]
     # A singular vector's sign is arbitrary; messages must not change with it
@@ -253,7 +253,7 @@ def robust_sigma(residuals: Floats) -> float:
 
 
 def in_base(vector: Floats, digits: int = 3) -> str:
-    """Return ``(0.020, 0.990, 0.010)``, without negative zeros."""
+    """Return a direction as text, ``(0.020, 0.990, 0.010)``, without negative zeros."""
     return "(" + ", ".join(f"{v:.{digits}f}" for v in np.round(vector, digits) + 0.0) + ")"
 
 
@@ -330,8 +330,8 @@ def unobservable(
 
     Args:
         problem: The sightings that agree.
-        places: (4, 4) of each unknown.
-        information: (P, P) of the places, with the effects marginalised.
+        places: Pose (4, 4) of each unknown.
+        information: (P, P) information about the places, with the effects marginalised.
         limits: Largest standard deviations of a rotation [rad] and of a translation [m].
         mark: Whether unobservable translations are marked instead of refused.
         freedoms: (6, k) unit twists of the possible motions, by frame.

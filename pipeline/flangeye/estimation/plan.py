@@ -49,7 +49,7 @@ class Preview:
 
     Attributes:
         problem: The estimation problem.
-        places: (4, 4) of each unknown.
+        places: Pose (4, 4) of each unknown.
         effects: The possible errors.
         model: The linear model at the places.
         fit: The fit of that model.
@@ -143,10 +143,10 @@ def most_informative(
     """Choose sightings greedily; each one minimises the variance that remains.
 
     Args:
-        rows: (M, 6, U) of M candidates, whitened.
-        covariance: (U, U) of all unknowns before.
+        rows: (M, 6, U) whitened rows of M candidates.
+        covariance: (U, U) covariance of all unknowns before the choice.
         levers: (A, U) linear functions whose summed variance is minimised.
-        count: How many to choose; all candidates, if there are fewer.
+        count: Number to choose; all candidates, if there are fewer.
 
     Returns:
         Indices of the chosen candidates, and the covariance (U, U) with them.
@@ -188,7 +188,7 @@ def predict(moments: Sequence[Observation], places: Places, cell: Cell) -> list[
     Args:
         moments: Observations with the carriers' poses, the camera and the target. The feature's
             value is ignored; its kind and covariance are used.
-        places: (4, 4) of each unknown, as estimated so far.
+        places: Pose (4, 4) of each unknown, as estimated so far.
         cell: The graph of frames.
     """
     poses = predicted_poses(moments, places, cell)

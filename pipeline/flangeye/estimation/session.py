@@ -451,7 +451,8 @@ def _require_size(session: Session) -> None:
     """Refuse a marker size or focal length that contradicts the arm's motion.
 
     Raises:
-        CalibrationRefused: One contradicts it; the message gives the better-known estimate.
+        CalibrationRefused: A size or focal length contradicts it; the message has the better
+            estimate.
     """
     told = [
         (float(mean[0]), float(np.sqrt(covariance[0, 0])), kind)

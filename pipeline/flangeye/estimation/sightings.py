@@ -148,7 +148,7 @@ def roll_note(
     Args:
         observations: The inlying observations.
         base_R_camera: (3, 3) the estimated rotation.
-        covariance: (3, 3) of that rotation [rad^2].
+        covariance: (3, 3) covariance of that rotation [rad^2].
     """
     turns = roll_of(observations, base_R_camera)
     # Fewer have no scatter that means anything

@@ -153,7 +153,7 @@ class _Loop(NamedTuple):
         seen: These sightings.
         camera: Known poses (N, 4, 4) and names of unknown frames, in order from the root to the
             camera.
-        target: The same from the root to the target.
+        target: Path from the root to the target.
     """
 
     problem: Problem

@@ -20,7 +20,7 @@ COUNT = 256
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """Where commands are sent.
+    """The poses of the work, at which the calibration will be used.
 
     Attributes:
         poses: Predicted sightings at new poses, at which the expected error is evaluated.
@@ -42,7 +42,7 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
 
     Args:
         problem: The session's sightings that agree.
-        places: (4, 4) of each unknown.
+        places: Pose (4, 4) of each unknown.
         box: Where the flange works, along the axes of the root; None for the session's region,
             known from its poses to one spacing between neighbours.
     """

@@ -87,7 +87,7 @@ def _pixels(path: Path) -> Floats:
 
 
 def _camera_of(path: Path, shape: tuple[int, ...]) -> CameraFile:
-    """Return the calibration beside a depth image of a shape."""
+    """Return the calibration beside a depth image, for images of its shape (H, W)."""
     # The folders' times of change are keys of the cache: the page runs on while a file is added
     changed = path.parent.stat().st_mtime_ns, path.parent.parent.stat().st_mtime_ns
     cameras = _cameras_beside(path.parent, changed)

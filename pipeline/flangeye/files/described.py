@@ -1,4 +1,4 @@
-"""Models whose fields are described by the text below each, as constants are."""
+"""Pydantic models whose fields are documented by the string below each field."""
 
 import ast
 import inspect
@@ -13,7 +13,7 @@ from pydantic_core import CoreSchema
 
 
 class Described(BaseModel):
-    """Base of models whose fields are described by the text below each.
+    """Base of models whose fields are documented by the string below each field.
 
     The source is parsed only when a description is needed, so that runs do not wait for it.
     """

@@ -69,7 +69,7 @@ def _loaded(where: str, text: str) -> Any:
 
 
 def _toml(file: Path) -> TableDocument | None:
-    """Return the sections of a TOML file, ``[12]`` above ``pose = [...]``; None for other texts."""
+    """Return the sections of a TOML file, such as ``[12]`` with a pose; None for other texts."""
     try:
         return TableDocument(tomllib.loads(read_text(file)), lambda at: f"{file}: record {at + 1}")
     except tomllib.TOMLDecodeError:
@@ -229,7 +229,7 @@ def _plain(value: Any) -> Any:
 
 
 def stacked(rows: Floats) -> Floats | None:
-    """Return the matrices (N, r, c) of an array (N r, c) that stacks them; None if it does not."""
+    """Return the matrices (N, r, c) stacked in an array (N r, c); None if it is no such stack."""
     for lines, width in MATRIX_SHAPES:
         if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or len(rows) % lines:
             continue

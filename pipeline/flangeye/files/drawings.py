@@ -95,7 +95,7 @@ def _line(name: str, groups: list[Group]) -> Floats:
 
 
 def _upright(path: Path, name: str, groups: list[Group], line: Floats) -> Floats:
-    """Return a flat entity's line in the drawing's axes; a mirrored one is seen from below."""
+    """Return a flat entity's line in the drawing's axes; entities drawn from below are mirrored."""
     up = float(next((v for c, v in groups if c == 230), "1"))
     if name == "LINE" or not len(line) or abs(up - 1) < 1e-6:
         return line

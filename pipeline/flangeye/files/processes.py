@@ -37,7 +37,7 @@ def require_memory(what: str, megabytes: int = 256) -> None:
     """Require that the process can be given so much more memory; none of it is used.
 
     Raises:
-        MemoryError: It cannot; the message begins with ``what``.
+        MemoryError: The memory is not available; the message begins with ``what``.
     """
     try:
         mmap.mmap(-1, megabytes << 20).close()

@@ -19,7 +19,7 @@ _POINTER = b"version https://git-lfs.github.com/spec/"
 
 
 def exists(path: Path) -> bool:
-    """Return whether there is a file or folder; a name that no file system takes has none."""
+    """Return whether there is a file or folder; False for an impossible name."""
     # Path.exists raises OSError for a name that is too long
     return os.path.exists(path)  # noqa: PTH110
 

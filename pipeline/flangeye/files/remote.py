@@ -199,7 +199,8 @@ def system_of(url: str) -> tuple[Any, str]:
         protocol = each.partition("://")[0]
         if "://" in each and protocol not in protocols:
             raise StageError(
-                f"{url}: no {protocol}:// is read; known: {', '.join(f'{p}://' for p in protocols)}"
+                f"{url}: {protocol}:// is not supported; "
+                f"known: {', '.join(f'{p}://' for p in protocols)}"
             )
     try:
         import fsspec

@@ -192,7 +192,7 @@ def edited(text: str, data: Mapping[Any, Any]) -> str:
 
     Args:
         text: A mapping in YAML.
-        data: What it shall hold; new keys stand where ``data`` has them.
+        data: Content that the text shall have; new keys stand where ``data`` has them.
 
     Raises:
         RecipeError: The text is not plain YAML.

@@ -75,7 +75,7 @@ def corrected_flange(
         base_T_flange: (4, 4) as reported.
         joints: (n,) as reported [rad], or None.
         correction: The arm's errors that the calibration found, if any.
-        arm: Its kinematics; needed when joint offsets are corrected.
+        arm: The arm's kinematics; needed when joint offsets are corrected.
 
     Raises:
         ValueError: Joint offsets are to be corrected without kinematics, or the pose is out of
@@ -109,7 +109,7 @@ def corrected_observation(
     Args:
         observation: The observation as recorded.
         correction: The arm's errors that the calibration found, if any.
-        arm: Its kinematics; needed when joint offsets are corrected.
+        arm: The arm's kinematics; needed when joint offsets are corrected.
         flange: Name of the arm's flange frame.
     """
     if correction is None:
@@ -141,7 +141,7 @@ def reported_flange(base_T_flange: Floats, correction: ArmCorrection, arm: Arm |
     Args:
         base_T_flange: (4, 4) true pose that the flange shall reach.
         correction: The arm's errors that the calibration found.
-        arm: Its kinematics; needed when joint offsets are corrected.
+        arm: The arm's kinematics; needed when joint offsets are corrected.
 
     Raises:
         ValueError: As :func:`corrected_flange` does.
@@ -187,7 +187,7 @@ def follow(arm: Arm, base_T_flange: Floats, near: Floats) -> Floats:
         near: (n,) joint angles to start from [rad].
 
     Raises:
-        ValueError: It does not get to every pose.
+        ValueError: The arm cannot reach every pose.
     """
     joints, reached = reached_from(arm, base_T_flange, near)
     if not reached.all():

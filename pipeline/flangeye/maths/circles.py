@@ -18,8 +18,8 @@ def edge_points(flat: Floats, centre: Floats, bins: int, outer: bool = True) -> 
     """Return the point farthest from (or nearest to) the centre in each of ``bins`` sectors.
 
     Args:
-        flat: (N, 2) [m].
-        centre: (2,) [m].
+        flat: (N, 2) points in the plane [m].
+        centre: (2,) centre of the sectors [m].
         bins: Number of equal sectors about the centre; those without points give none.
         outer: Farthest if true, nearest otherwise.
     """
@@ -65,7 +65,7 @@ def vote_centre(edges: tuple[tuple[Floats, float], ...], start: Floats, reach: f
     Args:
         edges: Edge points (K, 2) [m], each group with the radius [m] of its circle.
         start: (2,) where to look [m].
-        reach: How far from there the centre may be [m].
+        reach: Largest distance of the centre from there [m].
     """
     cell = min(radius for _, radius in edges) / 20
     half = int(np.ceil(reach / cell))

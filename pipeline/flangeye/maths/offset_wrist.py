@@ -194,7 +194,7 @@ def offset_wrist(directions: Floats, points: Floats, flange: Floats) -> OffsetWr
     """Return the solver of an arm; of the nominal arm if this one differs from it by little.
 
     Args:
-        directions: (6, 3) of the axes, all joints at zero.
+        directions: (6, 3) directions of the axes, all joints at zero.
         points: (6, 3) one on each axis [m].
         flange: (4, 4) base_T_flange, all joints at zero.
 
@@ -282,7 +282,7 @@ def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedFor
     """Return the closed form of an arm, or of the nominal one it differs from a little.
 
     Args:
-        directions: (6, 3) of the axes, all joints at zero.
+        directions: (6, 3) directions of the axes, all joints at zero.
         points: (6, 3) one on each axis [m].
         flange: (4, 4) base_T_flange, all joints at zero.
 

@@ -36,9 +36,9 @@ def reread(poses: Floats, read_as: str, written_as: str) -> Floats:
 
     Args:
         poses: The poses as read.
-        read_as: How the rotations were read, as :class:`PoseConvention`
+        read_as: Convention in which the rotations were read, as :class:`PoseConvention`
             names it.
-        written_as: How they were written; of as many numbers.
+        written_as: Convention in which they were written, with as many numbers.
     """
     out = np.array(poses)
     out[..., :3, :3] = _rotations(_numbers(poses[..., :3, :3], read_as), written_as)
@@ -77,7 +77,7 @@ def shifted(poses: Floats, by: int, start: int = 0) -> tuple[Floats, Mask]:
     """Return the poses shifted by whole samples, and the mask of samples that have one.
 
     Args:
-        poses: (N, 4, 4).
+        poses: (N, 4, 4) recorded poses.
         by: A sample's pose is the one recorded so many samples later.
         start: Index of the first sample that is shifted; those before keep their own.
     """
@@ -105,8 +105,8 @@ def delayed(poses: Floats, times: Floats, delay: float) -> tuple[Floats, Mask]:
     Poses between samples are interpolated, as if the arm moved at constant velocity.
 
     Args:
-        poses: (N, 4, 4).
-        times: (N,) of the poses, rising [s].
+        poses: (N, 4, 4) recorded poses.
+        times: (N,) times of the poses, rising [s].
         delay: Negative for earlier [s].
     """
     moved, kept = delayed_by_each(poses, times, np.array([delay]))

@@ -90,8 +90,8 @@ def largest_error_quantile(covariance: Floats, about: Floats, corners: Floats) -
 
     Args:
         covariance: (6, 6), order (rotation, translation), translation about ``about``.
-        about: (3,) in base [m].
-        corners: (8, 3) in base [m].
+        about: (3,) point in base to which the covariance refers [m].
+        corners: (8, 3) corners of the box in base [m].
     """
     variances, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.clip(variances, 0.0, None))

@@ -165,7 +165,7 @@ def clock_offset(
 
     Args:
         first: Times (N,) and a signal of motion (N,) there, of the first stream.
-        second: The same of the second, in any unit.
+        second: Speeds of the second stream, in any unit.
 
     Returns:
         Offset [s] and correlation; both 0 if no clear offset was found.

@@ -32,7 +32,7 @@ class TargetBody:
 
     Attributes:
         name: Shown in messages and reports.
-        vertices: (V, 3) [m].
+        vertices: (V, 3) vertices [m].
         triangles: (T, 3) indices of vertices.
         note: Note on how the unit was inferred; empty if it was stated.
     """
@@ -89,7 +89,7 @@ class ArmBody(TargetBody):
 
     Attributes:
         links: (V,) number of the frame that each vertex moves with, the base's 0.
-        arm: Its kinematics.
+        arm: The arm's kinematics.
     """
 
     links: Indices = field(default_factory=lambda: np.zeros(0, np.intp), kw_only=True)
@@ -234,7 +234,7 @@ def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[Len
             if stated
             else f"{across:.4g} across"
         )
-        other = f"it would be {in_each}" if fitting else "no unit makes it so"
+        other = f"it would be {in_each}" if fitting else "no known unit gives such a size"
         raise RecipeError(f"{path.name}: it is {has}, and {limits}; {other}")
     # Inches are assumed only if neither metres nor millimetres fit, centimetres last.
     used = min(fitting, key=("m", "mm", "in", "cm").index)

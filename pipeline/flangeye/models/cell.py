@@ -42,7 +42,7 @@ class Frame:
     """One frame of the graph: its parent and its place there.
 
     Attributes:
-        parent: Its parent frame.
+        parent: Name of the parent frame.
         place: parent_T_frame: (4, 4) if fixed and known; (M, 4, 4) if measured at M times; None if
             fixed and unknown.
     """
@@ -249,12 +249,12 @@ class Cell:
         """Return the frame graph with the places reported in N observations.
 
         Args:
-            observations: Their controllers' poses.
+            observations: Observations with the poses that controllers report.
             transforms: The unknowns by name, where they were found.
 
         Raises:
-            StageError: An observation lacks the pose of something that moves, or the joints that
-                a link's follows from.
+            StageError: An observation lacks the pose of something that moves, or the joint angles
+                from which a link's pose is computed.
         """
         found = {x.child: x.matrix for x in (transforms or {}).values()}
         measured = {name: _measured(name, observations) for name in self.movers}
@@ -309,7 +309,7 @@ class Cell:
 
         Args:
             transforms: The unknowns, by name.
-            observations: Their poses must already be corrected.
+            observations: Observations whose poses are corrected already.
 
         Raises:
             StageError: A carrier's pose is missing.
@@ -380,7 +380,7 @@ def cell_of(
     """Return the cell of one camera and one target that a configuration names.
 
     Args:
-        configuration: Who carries camera and target.
+        configuration: Mountings of camera and target.
         robot: The arm's model, where it is known.
         second: Model of a second arm that carries the target.
     """

@@ -117,8 +117,8 @@ class Ends:
     """Poses of camera and target at N observations, from the controllers and the transforms.
 
     Attributes:
-        camera: (N, 4, 4) of the camera, in ``base``.
-        target: (N, 4, 4) of the target, in ``base``.
+        camera: (N, 4, 4) poses of the camera in ``base``.
+        target: (N, 4, 4) poses of the target in ``base``.
     """
 
     camera: Floats

@@ -36,8 +36,8 @@ class Corners(NamedTuple):
     """N corners of a board: where they are in the image and on the board.
 
     Attributes:
-        pixels: (N, 2) in the image; the middle of the first pixel is (0, 0).
-        points: (N, 3) in ``target`` [m].
+        pixels: (N, 2) corners in the image; the middle of the first pixel is (0, 0).
+        points: (N, 3) the same corners on the board, in ``target`` [m].
     """
 
     pixels: Floats
@@ -65,7 +65,7 @@ class SeenBoard(NamedTuple):
 
     Attributes:
         kind: Which kind of board.
-        params: What the image shows of its parameters: columns, rows, dictionary, id.
+        params: Parameters of the board that the image shows: columns, rows, dictionary, id.
         what: The board's parameters as text.
     """
 

@@ -84,7 +84,7 @@ class FingerGeometry(Model):
 
     @property
     def flange_R_tool(self) -> Floats:
-        """Tool's axes in the flange's (3, 3); the tool's z points back to the robot."""
+        """Rotation (3, 3) of the tool's axes in ``flange``; its z points back to the robot."""
         # The flange's z points at the work, so the tool's z is opposite, and its y for handedness
         c, s = np.cos(self.direction), np.sin(self.direction)
         # Columns are the tool's axes in the flange.

@@ -22,7 +22,7 @@ class Topic(NamedTuple):
         name: Name with its namespace.
         type: ``sensor_msgs/msg/PointCloud2``.
         publishers: Names of the nodes that publish it.
-        subscribers: How many nodes listen.
+        subscribers: Number of nodes that listen.
     """
 
     name: str
@@ -58,7 +58,7 @@ class RunningCell:
             None for a camera of clouds or depths.
         files: Texts of the files that the sections name, by name.
         steps: Steps to add at the recipe's end.
-        steps_in_hand: The same, if the arm carries the camera.
+        steps_in_hand: Steps to add instead if the arm carries the camera.
         seen: Lines of text about what runs.
     """
 
@@ -85,7 +85,7 @@ class Ask(Protocol):
 
 
 class Graph(Device, Protocol):
-    """A network of nodes, joined; used as a context."""
+    """A network of running nodes that this program has joined; used as a context."""
 
     def topics(self) -> list[Topic]:
         """Return the topics that run, by name."""

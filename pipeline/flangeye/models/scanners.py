@@ -106,7 +106,7 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerDa
         path: The cloud's file.
         distance: Median distance of its points [m], if they are in ``unit``.
         unit: Unit that was stated or detected.
-        scanner: What it was recorded with.
+        scanner: Scanner that recorded the cloud.
 
     Raises:
         StageError: The range contradicts it; the message names the likely unit.
@@ -136,7 +136,7 @@ def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
     Args:
         path: The cloud's file.
         raw: Median distance of its points, in the file's unknown unit.
-        scanner: What it was recorded with.
+        scanner: Scanner that recorded the cloud.
 
     Raises:
         StageError: Neither metres nor millimetres fit.

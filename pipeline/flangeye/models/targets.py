@@ -114,7 +114,7 @@ class Sphere(BaseModel):
 
     Attributes:
         size: Radius of the sphere; None if it is estimated.
-        centre_in_flange: Its centre in the carrying frame, usually ``flange``.
+        centre_in_flange: Centre of the sphere in the carrying frame, usually ``flange``.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)

@@ -58,10 +58,10 @@ def require_metres(urdf: Path, what: str, xyz: Any) -> None:
 
 
 def mesh_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Any:
-    """Return the surface of a geometry's body as a trimesh, in its own frame [m]; to draw.
+    """Return a geometry's surface in its own frame [m] as a trimesh, for drawing.
 
     Raises:
-        RecipeError: It is not there, or cannot be read.
+        RecipeError: The mesh file is missing, or cannot be read.
     """
     import trimesh
 
@@ -177,13 +177,13 @@ def numbers_of(
 
     Args:
         urdf: The file, for the message.
-        element: What has it; None is as without it.
+        element: Element with the attribute; None counts as one without it.
         name: Name of the attribute.
-        default: Its text where there is none.
-        count: How many numbers the attribute has.
+        default: Text to use without the attribute.
+        count: Number of numbers that the attribute must have.
 
     Raises:
-        RecipeError: They are others, or not finite.
+        RecipeError: The attribute has another count of numbers, or some are not finite.
     """
     text = default if element is None else element.get(name, default)
     try:

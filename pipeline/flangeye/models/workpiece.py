@@ -55,7 +55,7 @@ class SeamLine(Model):
 
 
 class WorkpieceFile(Model):
-    """The file."""
+    """Content of a workpiece's YAML file."""
 
     title: str
     cad: str
@@ -94,9 +94,9 @@ class Workpiece:
 
     Attributes:
         title: Shown in messages and reports.
-        path: Its file.
+        path: Path of the workpiece's file.
         unit: Unit of the CAD, as configured.
-        vertices: (V, 3) [m].
+        vertices: (V, 3) vertices of the CAD [m].
         triangles: (T, 3) indices of vertices.
         seams: Seams by name.
     """

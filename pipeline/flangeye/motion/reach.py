@@ -51,7 +51,7 @@ class Reach:
     """The poses at which an arm can show its flange, a body on it, or itself to a scanner.
 
     Attributes:
-        arm: Its kinematics.
+        arm: The arm's kinematics.
         shown: (3,) axis of the flange that faces the scanner: z, or where a body is broadest.
         refusals: Requested poses that are impossible.
         home: (n,) joint angles of the pose that faces the scanner best; see :meth:`facing` [rad].
@@ -352,7 +352,7 @@ class Plan(NamedTuple):
     Attributes:
         poses: Poses in the order of their visit; a plan may choose each when it is asked for.
         wanted: Number of poses if the arm could reach them all.
-        centre: (3,) of the box they were wanted in, in ``base`` [m].
+        centre: (3,) centre of the box for the poses, in ``base`` [m].
         size: (3,) edges of that box [m].
     """
 

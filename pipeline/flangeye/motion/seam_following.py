@@ -28,8 +28,8 @@ class ToolPose:
     """The tool at one time.
 
     Attributes:
-        time: [s].
-        position: (3,) of the robot's end point P_r: where the tip would be, undeformed [m].
+        time: Time [s].
+        position: (3,) position of the robot's end point P_r: of the undeformed tip [m].
         angle: Angle of the tool's direction t_d from the plane's x [rad], continuous over turns.
     """
 
@@ -61,7 +61,7 @@ class Command:
     """The command to the robot for one control cycle.
 
     Attributes:
-        velocity: (3,) of the end point P_r [m/s].
+        velocity: (3,) velocity of the end point P_r [m/s].
         turn: Angular velocity about the plane's normal [rad/s].
     """
 

@@ -50,7 +50,7 @@ class Toucher:
         driver: Opens the arm.
         model: The arm's model.
         limits: The arm's motion limits; its speed is :data:`SLOW` at most.
-        tip: (3,) in the flange [m].
+        tip: (3,) position of the tip in ``flange`` [m].
         ask: Function that shows an instruction and returns when it is carried out.
     """
 

@@ -44,7 +44,7 @@ class PluginTable(MutableMapping[str, Kind]):
         self._held: dict[str, Kind | str] = {}
 
     def put(self, name: str, place: str) -> None:
-        """Note that ``name`` is at ``module:attribute``."""
+        """Register ``name``; its object is imported later, from ``module:attribute``."""
         self._held[name] = place
 
     def __setitem__(self, name: str, plugin: Kind) -> None:
@@ -288,7 +288,7 @@ def installed_plugins() -> list[EntryPoint]:
 
 @cache
 def _found(_: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Return the plugins on a search path; to look reads the metadata of every package there."""
+    """Return the plugins on a search path; slow, as every package's metadata is read."""
     return tuple(entry_points(group=PROJECT))
 
 

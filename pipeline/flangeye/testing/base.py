@@ -35,7 +35,7 @@ class Conformance:
 
     Attributes:
         stage: The plugin, as the decorator returned it.
-        part: The same, for parts.
+        part: The part under test, if it is no stage.
         params: Parameters of the plugin: a Params, or a mapping as in a recipe.
         kind: The kind this class is for.
     """

@@ -59,7 +59,7 @@ class Change:
 
     Attributes:
         matrix: (3, 3) rotation or reflection.
-        shift: (3,) [m].
+        shift: (3,) shift after rotation and scaling [m].
         scale: Factor of every length.
     """
 

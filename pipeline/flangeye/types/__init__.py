@@ -242,7 +242,7 @@ class Progress:
     """The state of a solver that still takes poses.
 
     Attributes:
-        poses: How many it has.
+        poses: Number of poses so far.
         error: No point of the workspace is off by more, with 95 % probability [m]; None while
             no answer can be trusted.
         required: When it stops [m].
@@ -275,16 +275,16 @@ class Seam:
     """A weld seam as it is planned, in ``base``, from its start to its end.
 
     Attributes:
-        points_in_base: (N, 3) along the root of the groove, N of at least 2 [m].
+        points_in_base: (N, 3) points along the root of the groove, two or more [m].
         openings_in_base: (N, 3) unit vectors out of the groove, towards the torch.
-        covariance: (N, 3, 3) of each point: where it is on the workpiece, and the hand-eye pose,
-            together [m^2]. Neighbours share most of it.
-        half_angle: Between a wall and the opening [rad], or None where it is not known.
+        covariance: (N, 3, 3) covariance of each point, from its place on the workpiece and from
+            the hand-eye pose [m^2]. Neighbours share most of it.
+        half_angle: Angle between a wall and the opening [rad]; None if unknown.
         half_width: Distance from the root's plane to a shoulder [m], or None where it is not known.
-        source: What it was planned from, as text.
-        figures: How well that went, in SI units, by name.
+        source: Text that names what the seam was planned from.
+        figures: Quality figures of the plan by name, SI units.
         notes: Warnings and records.
-        cloud: The part of the scan around it, in ``base``, for pictures only.
+        cloud: The part of the scan around the seam, in ``base``, for pictures only.
     """
 
     points_in_base: Array
@@ -323,24 +323,24 @@ class WeldReport:
     """Motion of tip, torch and robot in ``base``, in at most a few thousand samples.
 
     Attributes:
-        mode: How the seam was followed.
+        mode: Name of the way in which the seam was followed.
         completed: Whether the torch came to the seam's end.
-        reason: Why it did not; empty when it did.
+        reason: Reason why it did not; empty if it did.
         planned: (N, 3) the plan [m].
         refined: (M, 3) the seam measured by the tip; M may be zero [m].
         openings: (N, 3) unit vectors out of the work there: deviations are taken across them.
         time: (K,) since the weld began [s].
         tip: (K, 3) position of the finger's tip [m].
-        torch: (K, 3) [m].
+        torch: (K, 3) positions of the torch [m].
         robot: (K, 3) commanded position: that of an undeformed tip [m].
-        deflection: (K,) of the tip against the wall, as measured [m].
+        deflection: (K,) deflection of the tip against the wall, as measured [m].
         wanted: (K,) what was asked of it [m].
-        speed: (K,) of the robot's end point along the plane [m/s].
+        speed: (K,) speed of the robot's end point along the plane [m/s].
         turn: (K,) angular velocity of the tool [rad/s].
         along: (K,) the torch's way along the plan; the lead-in is before zero [m].
         phases: K names of what the controller was doing.
         figures: Figures by name, in SI units.
-        loop: How the loop kept time, by name, in SI units; differs from run to run.
+        loop: Timing figures of the loop by name, SI units; they differ from run to run.
         notes: Warnings and records.
         sigma: (K,) standard deviation of the torch's place across the seam [m], or empty.
         bound: (K,) what its distance from the seam does not exceed [m], or empty.

@@ -46,7 +46,7 @@ class SmoothField:
     Attributes:
         about: (3,) middle of the calibration's poses, in ``base`` [m].
         length: Correlation length of the field [m].
-        weights: (K,) of the features [m].
+        weights: (K,) weights of the features [m].
     """
 
     about: Array
@@ -94,7 +94,7 @@ class CorrectedArm:
 
     Attributes:
         camera: As in :class:`HandEye`.
-        correction: What to correct; None in a cell.
+        correction: Errors of the arm to correct; None in a cell.
         others: As in :class:`HandEye`.
         arms: As in :class:`HandEye`.
         shared: As in :class:`HandEye`.
@@ -207,9 +207,9 @@ class PoseError:
     """Error of a candidate calibration, and the point at which it matters.
 
     Attributes:
-        motion: (4, 4) in ``camera``; takes what was measured onto what was predicted.
+        motion: (4, 4) motion in ``camera`` from measured to predicted points.
         at: (3,) where the work is, in ``camera`` [m].
-        base_R_camera: (3, 3) of the candidate, to express the error in ``base``.
+        base_R_camera: (3, 3) rotation of the candidate, to express the error in ``base``.
     """
 
     motion: Array

@@ -24,11 +24,11 @@ class CircleFeature:
     """A circle fitted to the flange, or a sphere fitted to one mounted on it, in ``camera``.
 
     Attributes:
-        centre: (3,) [m].
+        centre: (3,) centre of the circle [m].
         normal: (3,) unit normal of the face, towards the scanner; None where only centres exist.
         radii: Fitted radii by name, for example ``{"rim": .., "bore": ..}`` [m].
-        covariance: (3, 3) of the centre [m^2].
-        normal_covariance: (3, 3) of the normal, singular along it; None with the normal.
+        covariance: (3, 3) covariance of the centre [m^2].
+        normal_covariance: (3, 3) covariance of the normal, singular along it; None with the normal.
         arc_coverage: Share of the rim's circumference that was seen, 0 to 1; 0 if not known.
         roll: Angle of the hole pattern about the normal [rad], or None when not visible.
         centre_in_flange: (3,) where the arm carries that centre, in ``flange`` [m]: its origin,
@@ -60,7 +60,7 @@ class PoseFeature:
     """A target whose full pose was measured, such as a marker.
 
     Attributes:
-        camera_T_target: Its pose; the target's z points towards the scanner.
+        camera_T_target: Pose of the target; its target's z points towards the scanner.
         covariance: (6, 6), order (rotation [rad], translation [m]), left perturbation in
             ``camera``, the translation taken at the target's origin.
         figures: Measures of the fit's quality, by name, in SI units and pixels.

@@ -234,7 +234,7 @@ class Box:
     """An axis-aligned box in the robot's base: where the work is.
 
     Attributes:
-        centre: (3,) [m].
+        centre: (3,) centre of the box [m].
         size: (3,) full edge lengths [m].
     """
 

@@ -267,7 +267,7 @@ def covariance_at(covariance: Floats, about: Floats, points: Floats) -> Floats:
     Args:
         covariance: Order (rotation, translation), left perturbation, translation about ``about``.
         about: (3,) reference point [m].
-        points: (N, 3) in the parent frame [m].
+        points: (N, 3) points in the parent frame [m].
     """
     # To first order a mapped point p moves by phi x (p - about) + tau
     jacobian = levers(np.asarray(points) - about)

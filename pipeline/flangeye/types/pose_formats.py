@@ -51,7 +51,7 @@ class PoseConvention:
 
     Attributes:
         name: Shown in messages and reports.
-        labels: What each number is called, position first.
+        labels: Name of each number, position first.
         rotation: ``vector``, a quaternion's order (``xyzw``, ``wxyz``) or one of
             :data:`EULER_ORDERS`, in which angles are written in the order of their axes.
         length: Unit of the position.

@@ -119,7 +119,7 @@ class ScanPlace:
     """The arm's pose while the scanner on its flange took a cloud.
 
     Attributes:
-        points: How many points it took there.
+        points: Number of points taken there.
         base_T_flange: (4, 4) as the controller reported it.
         joints: (n,) as reported [rad].
     """

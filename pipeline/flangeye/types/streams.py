@@ -25,7 +25,7 @@ class Stream(Generic[Item]):
 
     Attributes:
         source: What is known of where the values come from.
-        total: How many there will be, when known.
+        total: Number of values to come, if known.
         seen: The values pulled so far.
         whole: Whether all values were there from the start: pulling acquires nothing.
     """

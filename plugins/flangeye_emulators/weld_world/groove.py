@@ -88,7 +88,7 @@ class Groove:
 
     Attributes:
         root: The seam, in the plane of the work, with its height.
-        section: Its cross-section.
+        section: Cross-section of the groove.
         gaps: Pieces of wall that are missing.
         relief: Variation of the groove along the seam.
     """

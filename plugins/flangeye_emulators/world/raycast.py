@@ -74,7 +74,7 @@ def pixels_of(scanner: ScannerModel, resolution: float = 1.0) -> Pixels:
     """Return the rays through the pixels' centres.
 
     Args:
-        scanner: Gives the image and its field of view.
+        scanner: Scanner whose image size and field of view are used.
         resolution: Scale of columns and rows; the field of view stays.
     """
     columns = max(round(scanner.columns * resolution), 8)
@@ -179,8 +179,8 @@ class RaycastScene:
 
         Args:
             light: (3,) position of the light in ``camera`` [m].
-            pixels: The camera's.
-            depth: (H, W) of the points [m].
+            pixels: Pixels of the camera.
+            depth: (H, W) depth of the points [m].
             wanted: (H, W) pixels that matter.
         """
         import cv2
@@ -234,7 +234,7 @@ def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Imag
     """Return depth and slant (H, W) of pixels on the planes of their samples.
 
     Args:
-        pixels: The camera's.
+        pixels: Pixels of the camera.
         normals: (3, h, w) unit normals of the samples.
         away: (h, w) distance of the samples' planes from the camera [m]; infinite without a hit.
     """

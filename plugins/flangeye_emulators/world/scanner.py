@@ -187,7 +187,7 @@ def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Gener
     """Return an image (H, W) of spatially correlated standard normal values.
 
     Args:
-        shape: (H, W).
+        shape: Shape (H, W) of the image.
         width: Standard deviation of the Gaussian filter that correlates neighbours [px]; two
             pixels d apart then correlate by exp(-d^2 / (4 width^2)).
         rng: Random generator.

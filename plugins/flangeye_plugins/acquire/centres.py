@@ -95,7 +95,7 @@ def _notes(archive: Archive, used: int, noise: float, behind: float) -> tuple[st
     where = f"; they lie {behind * 1e3:g} mm behind the flange" if behind else ""
     return (
         *skipped_note(archive, lambda r: r.centre_in_camera is not None, "ready-made centre"),
-        f"{used} ready-made centres, each taken to be good to {noise * 1e3:g} mm along each axis"
+        f"{used} ready-made centres, assumed standard deviation {noise * 1e3:g} mm per axis"
         + where,
     )
 

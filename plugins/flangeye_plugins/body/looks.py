@@ -47,7 +47,7 @@ class Symmetry(NamedTuple):
 
 
 class EndPairs:
-    """Pairs of ends of a body's faces, to be found by how the two lie to each other."""
+    """Pairs of ends of a body's faces, found by the two ends' distance and angles."""
 
     def __init__(self, ends: OrientedPoints, seen: Mask, size: float) -> None:
         """Take the ends of a body of a ``size`` [m]; ``seen`` (V, N) are those visible at once."""
@@ -76,7 +76,7 @@ class EndPairs:
         return self._pairs[:, at[of, rank]], of
 
     def _relation(self, ends: OrientedPoints, pairs: Indices) -> Floats:
-        """Return distances and cosines (N, 9) that any motion leaves, in units of a tolerance."""
+        """Return distances and cosines (N, 9) unchanged by rigid motion, over their tolerances."""
         way = ends.points[pairs[1]] - ends.points[pairs[0]]
         apart = np.linalg.norm(way, axis=1)
         normals, outwards = ends.normals[pairs], ends.directions[pairs]

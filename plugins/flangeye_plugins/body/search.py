@@ -226,7 +226,7 @@ def candidate_poses(ends: OrientedPoints, view: CoarseImage, looks: Looks, effor
         ends: Ends of surfaces in the scan.
         view: Coarse image of the scan.
         looks: The body.
-        effort: How many times 20,000 pairs of ends are matched.
+        effort: Number of rounds, each of 20,000 pairs of ends.
     """
     poses = _matched(ends, looks, 20_000 * effort)
     # Points that are compared, and tolerance as a share of the size

@@ -424,7 +424,7 @@ def _require_known_place(session: RecordedSession) -> None:
     """Refuse a session in which the target's pose on the arm is unknown.
 
     Raises:
-        NotApplicable: It is not, or no arm has it.
+        NotApplicable: The target's pose is unknown, or no arm carries it.
     """
     session.require_samples()
     if session.carried == "camera":

@@ -277,7 +277,7 @@ def _factor(session: RecordedSession, null: VariantFits, along: Floats) -> float
 
     Args:
         session: The samples.
-        null: Their calibration as they are.
+        null: Fits of the unchanged session.
         along: (3,) 1 for each coordinate in the camera that grows, 0 for the others.
     """
     seen, equations = session.seen, equations_of(session)

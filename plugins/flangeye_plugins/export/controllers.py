@@ -48,7 +48,7 @@ class ControllerFormat:
         mark: Characters that begin a comment line.
         text: The template, behind the remarks.
         use: Where the file goes in the other program.
-        convention: How the numbers are written.
+        convention: Convention of the numbers.
         sort: ``{sort}`` of a camera beside the robot, and of one on the arm.
         params: ``NamedParams``, or ``NumberedParams`` for ``{number}``.
         reserved: Reserved words of the language, in lower case, which cannot be names.

@@ -225,7 +225,7 @@ class UrdfParams(FramesParams):
 
 
 def urdf(pose: CalibratedPose, params: UrdfParams) -> ExportedFile:
-    """Write URDF joints: the mount link's, where the camera's URDF is known, and the optical's."""
+    """Write URDF joints for the camera's mount link and its optical frame."""
     robot = ElementTree.Element("robot", name=params.name)
     for line in pose.remarks:
         # No "--" may stand in a comment, nor "-" at its end (XML 1.0, 2.5).

@@ -152,7 +152,7 @@ def _round(pose: Floats, covariance: Floats, symmetry: Symmetry) -> CircleFeatur
 
     Args:
         pose: (4, 4) ``camera_T_body``; its turn about the axis has no meaning.
-        covariance: (6, 6) of that pose.
+        covariance: (6, 6) covariance of that pose.
         symmetry: Symmetry of the body.
     """
     arm, axis = pose[:3, :3] @ symmetry.centre, pose[:3, :3] @ symmetry.axis

@@ -110,7 +110,7 @@ def disc_face(points: Floats, rough: Plane, ring: tuple[float, float], gate: flo
     """Return the plane of most points in a ring, with its normal towards the scanner.
 
     Args:
-        points: (N, 3) in the scanner's frame [m].
+        points: (N, 3) points in the scanner's frame [m].
         rough: Rough centre and normal of the disc.
         ring: Inner and outer radius about the rough centre that points must lie between [m].
         gate: Initial half thickness of the slab about the rough plane [m].

@@ -37,7 +37,7 @@ class PlanarPose(NamedTuple):
     misfit: float
 
     def blurred(self, position: float, angle: float) -> PlanarPose:
-        """Return the pose with variance added: of a position [m] and an angle [rad] per axis."""
+        """Return the pose with more noise per axis: standard deviations [m] and [rad]."""
         return self._replace(
             covariance=self.covariance + np.diag([angle**2] * 3 + [position**2] * 3)
         )

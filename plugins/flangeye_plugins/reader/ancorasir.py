@@ -82,7 +82,7 @@ def read_franka(folder: Path) -> Archive:
         for i, row in enumerate(rows)
     }
     archive = _in_millimetres(folder, poses_file, poses)
-    notes = ["the Franka's poses are those it was sent to, not those it measured"]
+    notes = ["the Franka's poses are commanded, not measured"]
     return replace(archive, layout="ancorasir franka", notes=notes)
 
 

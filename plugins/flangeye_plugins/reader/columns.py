@@ -117,7 +117,7 @@ class SeenPoseParams(ColumnsParams):
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """Return also "point", which has no rotation."""
+        """Return ``point`` as a further notation: a position without a rotation."""
         return (POINT,)
 
 

@@ -34,7 +34,7 @@ from flangeye.workflow.doctor.diagnosis import Arms
 
 
 class PoseMistake(Params):
-    """Mistakes of poses, corrected in the order of this list."""
+    """Mistakes in recorded poses; several are corrected in the order of these fields."""
 
     axes: Axes | None = None
     """Axes of the camera's frame, where z is not forward: opengl or ros."""

@@ -17,7 +17,7 @@ def pose_from_quaternion(where: str, position: Numbers, xyzw: Numbers) -> Floats
 
     Args:
         where: Prefix of messages: the file and the pose's name.
-        position: (3,) [m].
+        position: (3,) position [m].
         xyzw: (4,) quaternion.
 
     Raises:

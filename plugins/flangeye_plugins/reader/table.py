@@ -105,7 +105,7 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
 
     @classmethod
     def more(cls) -> tuple[str, ...]:
-        """Return also joint angles, which a table may have in place of poses."""
+        """Return joint angles as a further notation: a table may have them in place of poses."""
         return (BY_JOINTS,)
 
     @model_validator(mode="after")

@@ -216,7 +216,7 @@ class ManualRobot(Device):
             numbers = self._convention.read_numbers(line)
             pose = self._convention.matrix(numbers)
         except ValueError as error:
-            self._desk.say(f"{error}; once more, with decimal points")
+            self._desk.say(f"{error}; type the pose again, with decimal points")
             return
         joints = self._joints_at(pose, self._near)
         why = fault(numbers, self._convention, self._reach, self._asked, self._tolerance)

@@ -134,7 +134,7 @@ class Bridge(Device):
 
         Args:
             topic: Name of the topic.
-            kind: Type of its messages.
+            kind: Type of the topic's messages.
             always: Whether every message is forwarded, or only those requested by :meth:`want`.
             take: Called with each message in another thread, before :meth:`wait` returns it.
 

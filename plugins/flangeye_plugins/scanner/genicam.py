@@ -35,7 +35,7 @@ class RangeLayout:
     """Layout of a device's range map.
 
     Attributes:
-        shape: (rows, columns).
+        shape: Number of rows and columns.
         per_metre: Number of the device's units per metre.
         scale: (3,) scale factors of the transmitted coordinates.
         offset: (3,) offsets added after scaling, in the device's unit.

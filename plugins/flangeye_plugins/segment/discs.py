@@ -76,7 +76,7 @@ class Patch(NamedTuple):
     rest: Indices
 
     def around(self, reach: float, enough: int | None = None) -> Indices:
-        """Return the indices of ``rest`` within ``reach`` [m]; about ``enough`` if it is given."""
+        """Return the indices of ``rest`` within ``reach`` [m]; ``enough`` limits their number."""
         rest = self.rest
         if enough is not None:
             # A part of the largest size holds some fifty patches.
@@ -119,7 +119,7 @@ def flat_parts(
 
 
 def _whole(pieces: list[SurfacePiece], scatter: float) -> tuple[list[PlanarPiece], list[Indices]]:
-    """Return the pieces that are flat as a whole, and each piece's points left to search."""
+    """Return the pieces that are one plane, and the points of each piece on no plane yet."""
     # So many points settle the plane of a piece
     samples = [thinned(piece.points, enough=600) for piece in pieces]
     rough = [fit_plane(s.astype(np.float64), -s.mean(axis=0)) for s in samples]

@@ -143,13 +143,13 @@ def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
     """
     if not (problem.seen.ranks == 6).all():
         raise StageError(
-            "needs whole poses of a marker, and there are circles: use solve.linear or solve.robust"
+            "needs a marker's full poses, but these are circles: use solve.linear or solve.robust"
         )
     if len(problem.unknown) != 2:
         count = {1: "one", 3: "three"}.get(len(problem.unknown), str(len(problem.unknown)))
         raise StageError(
             f"has two unknowns, and the configuration leaves {count}: write place: unknown for a "
-            "marker on or before one arm, or use solve.robust"
+            "marker on or in front of one arm, or use solve.robust"
         )
     # Round the circle X M Z^-1 G = 1, with the carriers' pose G after the target's place
     _, known = loop_of(problem)

@@ -65,7 +65,7 @@ class ViewComparison:
 
     Attributes:
         error: Motion from the measured to the predicted flange in ``camera``.
-        registration: The same motion in ``flange``, with the quality of the fit.
+        registration: This motion in ``flange``, with the quality of the fit.
     """
 
     error: PoseError

@@ -107,7 +107,7 @@ def check_body(body: LeaningTool, prior: ModelPrior, settings: Following) -> Non
     above = float(body.torch[2]) + (prior.joint.seat(prior.radius)[1] if prior.joint else 0.0)
     if abs(above) > settings.torch_height:
         raise StageError(
-            f"weld.tactile: as the tool leans its torch is {above * 1e3:+.1f} mm above the seam, "
+            f"weld.tactile: the tool's lean puts its torch {above * 1e3:+.1f} mm above the seam, "
             f"limit {settings.torch_height * 1e3:.3g} mm; change 'travel_angle', or "
             "set torch_up in the finger's file to where the torch's end is"
         )

@@ -264,6 +264,6 @@ def _stations(task: Task) -> list[Station]:
 
 
 def _nearest(before: Floats, postures: Floats) -> Floats:
-    """Return the posture closest to ``before``, out of (K, n) and their whole turns."""
+    """Return the posture closest to ``before``, out of (K, n), joints moved by whole turns."""
     near = postures + 2 * np.pi * np.round((before - postures) / (2 * np.pi))
     return np.asarray(near[int(np.argmin(np.abs(near - before).max(axis=1)))])

@@ -88,7 +88,7 @@ def resume_point_of(log: FilePath, points: Floats) -> ResumePoint | None:
 
     Args:
         log: Log of the stopped weld.
-        points: (N, 3) of the plan, in the plane of the work [m].
+        points: (N, 3) points of the plan, in the plane of the work [m].
 
     Raises:
         StageError: The log holds no weld by touch, or a complete one, or one on another plan.

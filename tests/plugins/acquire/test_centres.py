@@ -80,7 +80,7 @@ def test_a_centre_has_the_stated_noise_and_no_normal(archive: Any) -> None:
     assert first.circle.normal is None and first.circle.normal_covariance is None
     assert stream.source.notes[-2:] == (
         "skipped 1 of 4 poses, without a ready-made centre: 3",
-        "3 ready-made centres, each taken to be good to 0.5 mm along each axis",
+        "3 ready-made centres, assumed standard deviation 0.5 mm per axis",
     )
 
 

@@ -357,7 +357,7 @@ def test_the_unit_is_judged_by_the_size_and_refused_where_it_cannot_be(tmp_path:
     assert inches.size == pytest.approx(GRIPPER.size, rel=1e-5)
     assert "unit: in is assumed" in inches.note
     written(1e5)
-    with pytest.raises(RecipeError, match="2.25e.04 across, .* no unit makes it so"):
+    with pytest.raises(RecipeError, match="2.25e.04 across, .* no known unit gives such a size"):
         load_body("own.stl", None, tmp_path)
     with pytest.raises(RecipeError, match=r"no body 'griper'; known: gripper"):
         load_body("griper", None, tmp_path)

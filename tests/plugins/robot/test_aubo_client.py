@@ -115,9 +115,9 @@ def test_a_connection_that_is_lost_is_let_go_of(library: Library) -> None:
 @pytest.mark.parametrize(
     ("code", "why"),
     [
-        (1, "the controller is not in a state for it"), (2, "its queue is full"), (3, "it is busy"),
+        (1, "the controller's present state does not allow it"), (2, "its queue is full"), (3, "it is busy"),
         (4, "it took too long"), (5, "an argument is invalid"),
-        (8, "this account may not do it"), (-1, "the controller is not in a state for it"),
+        (8, "this account has no permission for it"), (-1, "the controller's present state does not allow it"),
         (6, "return value 6"), (7, "return value 7"), (9, "return value 9"),
     ],
 )  # fmt: skip

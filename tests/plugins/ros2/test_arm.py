@@ -172,7 +172,9 @@ def test_joint_states_that_do_not_come_or_are_another_arms_are_refused(graph: Gr
     with refused("robot.ros2: joints names 5, but a ur5e has 6"):
         opened(joints=JOINTS[:5])
     graph.names = ("gripper", *JOINTS[1:])
-    with refused("robot.ros2: /joint_states: it has no joint j1, but gripper, j2, j3, j4, j5, j6"):
+    with refused(
+        "robot.ros2: /joint_states: it has no joint j1; it has gripper, j2, j3, j4, j5, j6"
+    ):
         opened()
     graph.silent = True
     with refused("robot.ros2: /joint_states: nothing came on it"):

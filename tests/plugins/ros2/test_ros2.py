@@ -102,7 +102,7 @@ def test_what_goes_wrong_with_an_arm_is_one_line(env):
     with peers(Controller(env)) as (arm,):
         with pytest.raises(DeviceError, match="no controller listens to /other"):
             opened(arm, trajectory="/other")
-        with pytest.raises(DeviceError, match="it has no joint elbow, but gripper_finger"):
+        with pytest.raises(DeviceError, match="it has no joint elbow; it has gripper_finger"):
             opened(arm, joints=(*arm.joints[:5], "elbow"))
         with opened(arm) as robot:
             arm.tell(rejects=True)

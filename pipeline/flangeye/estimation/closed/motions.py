@@ -21,8 +21,8 @@ class Motions:
     """K pairs of poses, as motions of the carrier and of the camera.
 
     Attributes:
-        a: (K, 4, 4) of the carrier.
-        b: (K, 4, 4) of the camera.
+        a: (K, 4, 4) motions of the carrier.
+        b: (K, 4, 4) motions of the camera.
         alpha: (K, 3) rotation vectors of the first [rad].
         beta: (K, 3) rotation vectors of the second [rad].
     """

@@ -76,7 +76,7 @@ def _along(s: Sightings) -> Floats:
 
 
 def _edge_size(s: Sightings) -> float:
-    """Return the fits' stated deviation of centres in the face, taken as edge rounding [m]."""
+    """Return the edge rounding [m]: the standard deviation that fits state for a tilted centre."""
     rows = s.by_depth & (s.ranks == 5)
     tilts = (_along(s)[rows] ** 2).sum()
     # All face the camera to a milliradian: seen alike
@@ -121,7 +121,7 @@ class DistortionField:
         return np.asarray(rigid), self.scanner.calibration_error / rms
 
     def moves(self, s: Sightings) -> Floats:
-        """Return (N, 6, K): how each weight turns and moves a target, in ``camera``."""
+        """Return the (N, 6, K) turns and shifts of targets by each unit weight, in ``camera``."""
         across, along, normals = (s.rotations[:, :, i] for i in range(3))
         radius = 30e-3  # to each side of a target [m]: a flange's radius
         bent = [(self.at(s.centres + radius * t) - self.at(s.centres - radius * t))

@@ -11,7 +11,7 @@ from flangeye.types.geometry import hat
 
 
 def innovations(problem: Problem, model: LinearModel) -> LinearModel:
-    """Return the model with what the earlier sightings predict of the drift taken away.
+    """Return the model after subtracting the drift predicted from earlier sightings.
 
     A random walk under white noise is predicted by exponential smoothing (Muth 1960): the share
     ``problem.walk`` of each innovation stays. Innovations are independent, and their likelihood is

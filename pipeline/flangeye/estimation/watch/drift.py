@@ -47,7 +47,8 @@ class CheckSightings:
     """N sightings of the target, relative to the stored calibration.
 
     Attributes:
-        residuals: (N, 5) of the centre in base [m], and of the normal across the flange's axis.
+        residuals: (N, 5) residuals of the centre in base [m], and of the normal across the
+            flange's axis.
         effects: (N, 5, 6 + K) derivatives of the residuals by a motion of the camera about
             ``about``, then by K weights of the arm's error, which are the same at every check.
         covariances: (N, 5, 5) noise of the residuals: of the scan, and of the arm beyond those
@@ -105,7 +106,7 @@ class DriftVerdict:
     Attributes:
         state: OK, DEGRADED or MOVED.
         motion: (6,) motion of the camera, about ``about`` (rotation [rad], translation [m]).
-        covariance: (6, 6) of the motion.
+        covariance: (6, 6) covariance of the motion.
         shift: Largest shift of a point of the work by the motion [m].
         since: Index of the first check after the change; None while there is none.
         statistic: Test statistic over its threshold; above 1 something moved.
@@ -124,8 +125,8 @@ class Information:
     """Information matrix and vector of the camera's motion and the arm's error weights.
 
     Attributes:
-        matrix: (..., 6 + K, 6 + K).
-        vector: (..., 6 + K).
+        matrix: (..., 6 + K, 6 + K) information matrix.
+        vector: (..., 6 + K) information vector.
     """
 
     matrix: Floats
@@ -374,11 +375,11 @@ def sightings_of(  # noqa: PLR0913  one argument a measured quantity
     Args:
         pose: (4, 4) base_T_camera.
         about: (3,) reference point of motions [m].
-        centres: (N, 3) in camera [m].
-        normals: (N, 3) in camera; NaN where none was measured.
+        centres: (N, 3) circle centres in camera [m].
+        normals: (N, 3) unit normals in camera; NaN where none was measured.
         covariances: (N, 5, 5) in base, tilts across the flange's axis last.
         expected: (N, 4, 4) expected pose of the circle in base, by the arm.
-        jacobians: (N, 6, n) of the circle's centre (rotation, translation), or None.
+        jacobians: (N, 6, n) Jacobians of the circle's centre (rotation, translation), or None.
         check: (N,) index of each sighting's check.
     """
     turn, axes = pose[:3, :3], expected[:, :3, 2]

@@ -80,10 +80,10 @@ def pose_error_of(residuals: Floats, effects: Floats, own: Floats, poses: Floats
     """Return the error of an arm from a calibration's N residuals.
 
     Args:
-        residuals: (N, 5) of centre [m] and tilt [rad].
+        residuals: (N, 5) residuals of centre [m] and tilt [rad].
         effects: (N, 5, 6) derivatives of the residuals by a free motion of the camera.
         own: (N, 5, 5) covariances of the scans alone.
-        poses: (N, 4, 4) of the circle in ``base``.
+        poses: (N, 4, 4) poses of the circle in ``base``.
     """
     # Four sizes are hardly better known from more than sixty poses
     chosen = np.unique(np.linspace(0, len(poses) - 1, 60).astype(int))

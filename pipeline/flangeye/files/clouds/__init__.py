@@ -29,7 +29,7 @@ def mark_missing(xyz: Points) -> str:
     less and all others are on one side.
 
     Args:
-        xyz: (N, 3) in the file's own unit.
+        xyz: (N, 3) points in the file's own unit.
 
     Returns:
         Sentence about which points were taken as missing, and how many; empty if none were.

@@ -266,7 +266,7 @@ class LoadedTable(PointTable):
     """Points that had to be loaded to be found.
 
     Attributes:
-        xyz: (N, 3).
+        xyz: (N, 3) points.
         unit: Unit of the coordinates, where the arrays' names state it; else empty.
     """
 

@@ -72,7 +72,7 @@ class Table:
         """Return the index from 0 of a column, by its name or its number from 1.
 
         Raises:
-            StageError: There is none; names the nearest.
+            StageError: The column is missing; the message names the nearest.
         """
         width = min(len(cells) for _, cells in self.rows)
         if isinstance(column, int):
@@ -89,7 +89,7 @@ class Table:
         """Return the indices of columns, from 0; ``pose`` also means ``pose.0``, ``pose.1``, ….
 
         Raises:
-            StageError: There is none of a name; names the nearest.
+            StageError: A column is missing; the message names the nearest.
         """
         return [i for column in columns for i in (self._listed(column) or [self.index(column)])]
 
@@ -305,7 +305,7 @@ def table_of(records: Sequence[tuple[str, Any]]) -> Rows:
 
 
 def _heading(columns: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of columns; empty where they are only counted."""
+    """Return the names of columns; empty if the columns are numbered, not named."""
     named = any(name.replace(".", "") and not name.replace(".", "").isdigit()
                 for name in columns if name != SCAN)  # fmt: skip
     return tuple(columns) if named else ()

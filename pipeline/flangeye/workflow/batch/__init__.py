@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 def run_batch(request: Request, registry: Registry, console: Console) -> Batch:
     """Run every session that has not finished yet, and compare them all.
 
-    The tables are written whatever ends the batch, with the sessions that came so far.
+    However the batch ends, the tables are written with the sessions finished so far.
 
     Args:
         request: The batch to run.

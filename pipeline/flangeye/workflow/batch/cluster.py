@@ -127,7 +127,7 @@ def cores() -> int:
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Client]:
-    """Start workers here, one process and one thread each, and stop them at the end."""
+    """Start workers on this computer, each a process with one thread; stop them at the end."""
     import dask
     from distributed import Client, LocalCluster, Security
 

@@ -137,7 +137,7 @@ class Dataset:
             yield from table.to_pylist()
 
     def _parts(self) -> dict[int, list[str]]:
-        """Return the files of each block."""
+        """Return the names of the Parquet files of each block, by the block's number."""
         parts: dict[int, list[str]] = {}
         for name in self._place.names(FOLDER):
             number = name.removeprefix(f"{FOLDER}/")[:6]

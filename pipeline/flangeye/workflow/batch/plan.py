@@ -67,7 +67,7 @@ def common_key(recipe: Recipe, software: Software, prints: Fingerprints) -> str:
 
 
 def session_key(common: str, seed: int, archive: str | None, prints: Fingerprints) -> str:
-    """Return the hash of all that decides a session's result; ``common`` from above."""
+    """Return the hash of all that decides a session's result; ``common`` is the shared part's."""
     given = [archive, prints.of_archive(archive)] if archive else []
     return sha256(json.dumps([common, seed, *given]))
 

@@ -36,7 +36,7 @@ class VariantSummary:
     """Summary of the sessions of one variant.
 
     Attributes:
-        names: Its values, in the order of :meth:`Tally.by`.
+        names: The variant's values, in the order of :meth:`Tally.by`.
         counts: Number of sessions by status.
         medians: Figure -> median over the accepted sessions [m]; None without any.
     """

@@ -96,7 +96,7 @@ class CellSession:
 
     @cached_property
     def _data(self) -> dict[str, Any]:
-        """The recipe with every default, to be read again."""
+        """The recipe as data, with every default written out."""
         return _as_data(self._files["recipe.resolved.yaml"], self.recipe.name)
 
     @cached_property

@@ -74,7 +74,7 @@ class Entry:
     """One value a step gave.
 
     Attributes:
-        step: Its label, such as ``2.fit.rim``.
+        step: Label of the step, such as ``2.fit.rim``.
         capture: The capture's id, for steps that run once per capture.
         seconds: Duration [s].
         type: Name of the value's type.
@@ -103,7 +103,7 @@ class JournalEntry:
     """One line of a step's log.
 
     Attributes:
-        step: Its label, such as ``7.weld.tactile``.
+        step: Label of the step, such as ``7.weld.tactile``.
         name: Name of the entry.
         value: Plain data; pixels (H, W) or (H, W, 3) for an image.
     """
@@ -436,7 +436,7 @@ def _take_json(
 
 
 def _check_kind(entry: Entry) -> None:
-    """Refuse what no stage of a kind gives."""
+    """Refuse a value of a type that no stage of its kind returns."""
     # What the steps of a kind give, where others rely on it
     expected: tuple[type, ...] | None = {
         "segment": (t.FlangeCloud,),

@@ -54,7 +54,7 @@ class Channel(NamedTuple):
     """A message channel: its topic and schema.
 
     Attributes:
-        topic: Its name.
+        topic: Name of the topic.
         schema: Name of the messages' schema.
         schema_encoding: ``jsonschema`` or ``protobuf``.
         schema_data: The schema itself.
@@ -98,7 +98,7 @@ class LogFile:
 
     Attributes:
         damaged: Called with one sentence about each damaged part.
-        library: What wrote the log.
+        library: Name of the program that wrote the log.
         attachments: Name -> bytes, of those that are sound.
         ended: Whether the log has its end.
     """

@@ -82,12 +82,12 @@ class Recipe:
 
     @property
     def notes(self) -> tuple[t.Note, ...]:
-        """Notes on how its own files were read."""
+        """Notes on how the robot's file was read."""
         robot = self.context.get(RobotModel)
         return robot.notes if robot else ()
 
     def data(self) -> dict[str, Any]:
-        """Return the same as plain data."""
+        """Return the recipe as plain data, with every default and override."""
         return {**sections(self.header), "steps": self._steps_as_data()}
 
     def _steps_as_data(self) -> list[Any]:
@@ -371,8 +371,8 @@ def _require_reached(path: Path, robot: RobotModel) -> None:
     freedoms = 6  # joints that reach a pose in any orientation
     if arm.n < freedoms:
         raise RecipeError(
-            f"{path}: robot: {robot.model} has {arm.n} joints, and the poses of a plan need "
-            f"{freedoms}; record poses by hand and read them: robot: {{flange: ISO 9409-1-50-4-M6}}"
+            f"{path}: robot: {robot.model} has {arm.n} joints, and planned poses need "
+            f"{freedoms}; record poses by hand, and write robot: {{flange: ISO 9409-1-50-4-M6}}"
         )
     low, high = np.maximum(arm.lower, -np.pi), np.minimum(arm.upper, np.pi)
     # Of each joint's range: poses that are looked for again, away from the middle's singular ones

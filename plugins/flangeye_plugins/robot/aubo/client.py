@@ -98,12 +98,12 @@ class AuboClient:
         if code != 0:
             # AuboErrorCodes, those that a move can meet
             why = {
-                1: "the controller is not in a state for it",
+                1: "the controller's present state does not allow it",
                 2: "its queue is full",
                 3: "it is busy",
                 4: "it took too long",
                 5: "an argument is invalid",
-                8: "this account may not do it",
+                8: "this account has no permission for it",
             }.get(abs(code), f"return value {code}")
             raise DeviceError(f"{self._name}: {what}: not done: {why}")
 

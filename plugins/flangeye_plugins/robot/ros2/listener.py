@@ -253,4 +253,4 @@ class Listener(Device):
         lost = [joint for joint in self._params.joints if joint not in self._heard]
         if not self._heard or not lost:
             return ""
-        return f"it has no joint {', '.join(lost)}, but {', '.join(sorted(self._heard))}"
+        return f"it has no joint {', '.join(lost)}; it has {', '.join(sorted(self._heard))}"

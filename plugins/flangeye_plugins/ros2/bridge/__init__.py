@@ -1,1 +1,1 @@
-"""The bridge process, in its own folder so that its Python imports no other module."""
+"""The bridge process; alone in its folder, as ROS 2's Python must import nothing else of ours."""

@@ -314,7 +314,7 @@ class RefinedPath:
         return float(self._places[self._next - 1])
 
     def _between(self, kept: Floats, s: Floats) -> Floats:
-        """Return values kept per place (M, N), interpolated at arc lengths (K,)."""
+        """Return the filters' values at N places (M, N), interpolated at arc lengths (K,)."""
         first = (s - self._start) / PATH_SPACING - 0.5
         below = np.minimum(np.maximum(first.astype(int), 0), max(self._next - 2, 0))
         share = np.minimum(np.maximum(first - below, 0.0), 1.0)

@@ -119,9 +119,9 @@ class Steering:
         distance: Distance from tip to torch, ||d|| in the paper [m].
         gain: k_c, gain on the torch's cross-track error [1/s].
         rate: Largest angular velocity [rad/s].
-        regular: n_d . n_t above which equation (16) alone decides; below half of it, it is not
-            used.
-        share: Largest speed of the error's correction, as a share of the tip's speed.
+        regular: n_d . n_t from which equation (16) has the full weight; below half of this value
+            its weight is zero.
+        share: Largest speed at which the error is corrected, as a share of the tip's speed.
         usual: Share of ``rate`` that following or weaving may use; the rest is left for
             corrections.
     """
@@ -139,10 +139,10 @@ class Steering:
         """Return the angular velocity [rad/s], never beyond :attr:`rate`.
 
         Args:
-            velocity: (2,) of the robot's end point [m/s].
+            velocity: (2,) velocity of the robot's end point [m/s].
             tool: (2,) unit vector from the torch to the tip, t_d.
             normal: (2,) unit normal of the refined path at the torch, n_t.
-            error: How far the torch is off the refined path, along ``normal`` [m].
+            error: Distance of the torch from the refined path, along ``normal`` [m].
             sway: Velocity of the weave, to the left [m/s].
         """
         cosine, sine = _cos_sin(tool, normal)
@@ -219,7 +219,7 @@ class TorchLead:
         """Return the angular velocity that keeps the torch on its target [rad/s].
 
         Args:
-            velocity: (2,) of the robot's end point [m/s].
+            velocity: (2,) velocity of the robot's end point [m/s].
             coming: Predicted pose of the tool.
             normal: (2,) unit normal of the refined path at the torch.
             off: Offset of the torch to the left of that path [m].

@@ -89,8 +89,8 @@ def test_a_check_of_an_unknown_or_a_far_time_that_found_a_step_at_once_is_read(
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
-        (finding(1, since=2), "the finding stored with it is of another check"),
-        (finding(0), "the finding stored with it is of another check"),
+        (finding(1, since=2), "its stored verdict belongs to another check"),
+        (finding(0), "its stored verdict belongs to another check"),
         (finding(1, motion=(0.0,) * 5), "motion: "),
         (finding(1, motion=(0.0,) * 7), "motion: "),
     ],

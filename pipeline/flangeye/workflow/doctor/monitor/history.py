@@ -246,7 +246,7 @@ def _plain(check: MonitorCheck) -> Any:
 def _require_usable(number: int, check: MonitorCheck, finding: CheckFinding) -> None:
     """Refuse a check whose values are valid one by one but contradict each other."""
     if finding.check != number or (finding.since or 0) > number:
-        raise DamageError("the finding stored with it is of another check")
+        raise DamageError("its stored verdict belongs to another check")
     if not check.seen:
         raise DamageError("it has no sighting")
     for seen in check.seen:

@@ -44,7 +44,9 @@ def draft_live(cell: RunningCell, questions: Questions, out: Path) -> Draft:
     Raises:
         RecipeError: An answer is missing or invalid.
     """
-    plate = questions.ask("plate", "which plate the flange is ('flangeye standards')", PLATE)
+    plate = questions.ask(
+        "plate", "which ISO 9409-1 plate the flange has ('flangeye standards')", PLATE
+    )
     name = questions.ask("scanner", "which scanner ('flangeye scanners')", None, "realsense-d435")
     scanner = load_model("scanners", name)
     if not isinstance(scanner, ScannerModel):

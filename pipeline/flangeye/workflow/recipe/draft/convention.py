@@ -324,7 +324,7 @@ def _halves(arm: PoseColumns) -> tuple[PoseColumns, PoseColumns]:
     """Return the first and the second half of a table's rows, where both can be poses.
 
     Raises:
-        RecipeError: They cannot.
+        RecipeError: The halves cannot be poses.
     """
     table = arm.table
     if len(table.files) > 1 or ":" in table.name or len(table.rows) % 2 or table.heading:
@@ -428,7 +428,8 @@ def _measured(poses: Floats, marks: Floats, target: PoseColumns, questions: Ques
         questions.mended["axes"] = target.axes_of_motion
     questions.assumed.append(
         f"{target.table.name}: poses from images alone have no scale; by the arm's motion one unit "
-        f"is {size:.4g} m, for a camera in hand (the target's scale: in the recipe changes it)"
+        f"is {size:.4g} m if the arm carries the camera (the target's scale: in the recipe changes "
+        "it)"
     )
     return scaled(marks, np.full(3, size))
 

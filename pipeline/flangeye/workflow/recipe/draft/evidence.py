@@ -388,7 +388,7 @@ def mounting_of(
 
 
 def size_of(arm: Floats, seen: Floats) -> float | None:
-    """Return the length [m] of the unit of a target's places, seen by a camera in the hand.
+    """Return the length [m] of one unit of the target's positions, for a camera on the flange.
 
     ``(R_A - 1) t_X - s R_X t_B = -t_A`` is linear in t_X and s; None if it determines no length.
     """

@@ -284,7 +284,7 @@ def rotation_seen(
 
     Args:
         drafts: Recipes that differ in the convention only, by its name.
-        observations: What the scans of one of them show.
+        observations: Observations by one of the recipes.
 
     Returns:
         None if they decide for none.
@@ -370,7 +370,7 @@ def _head(
     head: dict[str, Any] = {"title": f"Calibration from {folder.resolve().name}"}
     feature = {"sphere": target["sphere"]} if "sphere" in target else {}
     if "flange" in target and not _has_plate(robot):
-        question = "which plate the flange is ('flangeye standards')"
+        question = "which ISO 9409-1 plate the flange has ('flangeye standards')"
         feature = {"standard": questions.ask("plate", question, PLATE, check=load_standard)}
     if "flange" in target and not robot:
         robot, feature = {"flange": feature["standard"]}, {}
