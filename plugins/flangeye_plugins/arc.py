@@ -139,7 +139,7 @@ class UrDigitalArc(Device):
 
     def _negotiate(self) -> None:
         """Set up RTDE: receive the bits of the digital inputs, send those of the outputs."""
-        # Of RTDE
+        # RTDE's requests: V protocol version 2, O values to receive, I values to send, S start
         self._asked("V", struct.pack(">H", 2))
         # Packages in a second [Hz]: what every generation of controller can send
         self._asked("O", struct.pack(">d", 125.0) + b"actual_digital_input_bits")
