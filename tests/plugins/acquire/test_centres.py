@@ -89,7 +89,7 @@ def test_centres_of_a_wrist_circle_lie_behind_the_flange(archive: Any) -> None:
     chosen = CentresParams(reader=auto.bind())
     wrist = acquire_centres(ArchivePath(archive), chosen, wrist_circle_of(robot.flange, 0.09))
     plain = list(acquire(archive))
-    assert wrist.source.notes[-1].endswith("along each axis; they lie 6.5 mm behind the flange")
+    assert wrist.source.notes[-1].endswith("mm per axis; they lie 6.5 mm behind the flange")
     for behind, at_face in zip(wrist, plain, strict=True):
         offset = behind.tcp_in_base - at_face.tcp_in_base
         assert offset == pytest.approx(-6.5e-3 * behind.base_T_flange.rotation[:, 2], abs=1e-15)

@@ -176,7 +176,7 @@ def test_it_proposes_poses_that_would_tell_more() -> None:
     listed = said.split("joints in deg: ")[1].split("; with them")[0].split("; ")
     assert len(listed) == 6
     assert all(len(pose.split(", ")) == 6 for pose in listed)
-    known = int(before.split(", and ")[1].split(" combination")[0])
+    known = int(before.removeprefix("the poses identify ").split(" combination")[0])
     assert int(said.split(", and ")[-1].split(" combination")[0]) > known
 
 
