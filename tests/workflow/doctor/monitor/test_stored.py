@@ -222,3 +222,12 @@ def test_later_recordings_are_read_from_an_archive_whatever_the_calibration_took
     log = replace(stored.log, attachments={"recipe.resolved.yaml": recipe.encode()})
     with pytest.raises(StageError, match="no reader knows this layout"):
         from_archive(tmp_path, replace(stored, log=log), load_registry())
+
+
+@pytest.mark.parametrize("recipe", ["", "title: T", "robot: ur5e\nsteps: []", "only a text"])
+def test_a_calibration_whose_recipe_has_no_steps_says_that_nothing_reads_scans(
+    stored: StoredCalibration, recipe: str, tmp_path: Path
+) -> None:
+    log = replace(stored.log, attachments={"recipe.resolved.yaml": recipe.encode()})
+    with pytest.raises(StageError):
+        from_archive(tmp_path, replace(stored, log=log), load_registry())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ def from_arm(
         NothingMoved: ``move`` is false; the message is the plan.
         StageError: The recipe drives no arm, or the flange is in none of the scans.
     """
-    first = str(_steps(stored)["steps"][0])
+    first = str(_recipe(stored)["steps"][0])
     if "acquire.live" not in first:
         raise StageError(
             f"{stored.path}: was not calibrated live; take scans yourself and name them with "
@@ -86,7 +86,7 @@ def _of_log(log: RunLog) -> tuple[list[t.Observation], int]:
 
 def _from_archive(stored: StoredCalibration) -> str:
     """Return the calibration's recipe, made to read recordings."""
-    data = _steps(stored)
+    data = _recipe(stored)
     first = data["steps"][0]
     # These steps read later recordings as they read the calibration's. One scan is a check,
     # though it would be no calibration: hence `fewest`
@@ -97,12 +97,13 @@ def _from_archive(stored: StoredCalibration) -> str:
     return dumped(data)
 
 
-def _steps(stored: StoredCalibration) -> dict[str, Any]:
-    if not stored.recipe:
+def _recipe(stored: StoredCalibration) -> dict[str, Any]:
+    data = parse_yaml(stored.recipe, stored.path.name).data if stored.recipe else None
+    if not (isinstance(data, Mapping) and data.get("steps")):
         raise StageError(
-            f"{stored.path}: holds no recipe, so nothing says how to take or read scans"
+            f"{stored.path}: holds no recipe with steps, so nothing says how to take or read scans"
         )
-    return dict(parse_yaml(stored.recipe, stored.path.name).data)
+    return dict(data)
 
 
 def _checked(
