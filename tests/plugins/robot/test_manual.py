@@ -148,7 +148,7 @@ def test_yes_to_nothing_is_no_pose(person: Person) -> None:
     person.types("yes")
     person.types(CONVENTIONS["ur"].text(AT_HOME.matrix))
     person.robot()
-    assert "UR has 6 numbers (X Y Z RX RY RZ), not 0; once more" in person.said.getvalue()
+    assert "UR has 6 numbers (X Y Z RX RY RZ), not 0; type the pose again" in person.said.getvalue()
 
 
 def test_a_pose_out_of_reach_is_never_taken(person: Person) -> None:

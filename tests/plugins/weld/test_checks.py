@@ -96,7 +96,8 @@ def test_preload_and_deflection_outweigh_what_lifts_the_tip_by_fourteen_tenths(
 
 
 @pytest.mark.parametrize(
-    ("up", "says"), [(8e-3, None), (8.1e-3, "torch is +8.1 mm"), (-8.1e-3, "torch is -8.1 mm")]
+    ("up", "says"),
+    [(8e-3, None), (8.1e-3, "its torch +8.1 mm above"), (-8.1e-3, "its torch -8.1 mm above")],
 )
 def test_a_torch_is_within_its_height_of_the_seam(up: float, says: str | None) -> None:
     """On a joint the ball's centre is above the seam by its seat."""

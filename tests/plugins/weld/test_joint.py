@@ -137,7 +137,7 @@ def test_a_joint_that_would_not_hold_the_tip_is_refused(given, message: str) -> 
 def test_a_torch_lifted_off_the_seam_by_a_leaning_tool_is_refused() -> None:
     prior, settings = believed(travel_angle="20 deg")
     body = body_of(Finger.model_validate(FINGER), settings)
-    with pytest.raises(StageError, match="torch is .13.7 mm above the seam.*torch_up"):
+    with pytest.raises(StageError, match="its torch .13.7 mm above the seam.*torch_up"):
         check_body(body, prior, settings)
 
 
