@@ -4,13 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from flangeye.maths.kinematics import Arm
+from flangeye.models.bodies import TargetBody
 from flangeye.models.loading import load_model
 from flangeye.models.robots import Volume
-from flangeye.motion.clearance import ArmVolume, segment_distance
+from flangeye.motion.clearance import ArmVolume, BodyView, segment_distance
 
 A_POINT = 2e-6
 """A segment shorter than a micrometre counts as a point [m]."""
@@ -141,3 +143,17 @@ def test_a_line_of_sight_through_the_arm_is_not_free() -> None:
     beside = np.array([[[-1.0, 0.4, 0.4], [1.0, 0.4, 0.4]]])
     assert not volume.leaves_free(axes, through, 0.03)
     assert volume.leaves_free(axes, beside, 0.03)
+
+
+def test_a_body_is_seen_where_the_flange_carries_it() -> None:
+    """Its points are on the flange, and it hides what lies behind it there."""
+    arm = Arm(load_model("robots", "ur5e"))
+    joints = np.radians([10.0, -80.0, 100.0, -60.0, -90.0, 20.0])
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    box = TargetBody("box", np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+    placed = BodyView(box, arm).placed(joints)
+    flange = arm.flange(joints)
+    own = (placed.points - flange[:3, 3]) @ flange[:3, :3]
+    assert np.abs(own / (0.05, 0.03, 0.02)).max(axis=1) == pytest.approx(1.0, abs=1e-9)
+    shown = placed.faces(flange[:3, 3] + 0.5 * flange[:3, 2]) > 0
+    assert shown[own[:, 2] > 0.02 - 1e-9].all() and not shown[own[:, 2] < 0.018].any()
