@@ -393,3 +393,16 @@ def test_an_arm_that_touches_itself_is_in_its_own_way() -> None:
     arm = seen_from_above()
     assert not arm._volume.apart(arm._volume.axes(ARM.frames(folded)))
     assert not arm._clear(folded)
+
+
+def test_what_the_projector_does_not_light_is_not_seen() -> None:
+    """From 45 degrees to the side it leaves the gripper's other side dark."""
+    wide = {"near": 0.1, "far": 9.0, "field_of_view": np.radians([120.0, 120.0])}
+    camera = ARM.flange(SHOWN) @ rigid(rotation_from_rpy(np.pi, 0.0, 0.0), np.zeros(3))
+    camera[:3, 3] -= 0.8 * camera[:3, 2]
+    body = load_body("gripper", None, Path())
+    alone, aside = (
+        Reach(MODEL, scanner(**wide, baseline=at), camera, body)._seen(SHOWN)[1]
+        for at in (0.0, 0.8)
+    )
+    assert alone == pytest.approx(1.0) and aside < 0.8
