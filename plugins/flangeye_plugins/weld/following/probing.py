@@ -7,7 +7,9 @@ Gain error ``g`` and half width ``w`` of play and hysteresis are estimated by le
 and the reversal's length by a grid search.
 
 Both sides are swept with the tool turned a little to the left, then to the right. The turn shifts
-``c`` in proportion to the error of the tip's position ahead, which is estimated from it.
+``c`` in proportion to the error of the tip's position ahead, which is estimated from it. Along
+walls that stand askew to the plan the tip slides, which shifts ``c`` as well: their slope is
+estimated too.
 
 A tip that climbs its wall shows less displacement than it should when pressed hard, and is higher
 there. In that case the sweep is repeated with half the reach. The weld then presses by a third of
@@ -186,57 +188,41 @@ class Probing:
         unlikely += ((stamps - prior.stamp) / prior.stamp_sigma) ** 2
         unlikely += ((solutions[:, 2] + prior.play) / prior.play_sigma) ** 2
         best = int(np.argmin(unlikely))
-        _, across, play, _, ahead = solutions[best].tolist()
-        slid = felt[:, 3] - felt[:, 3].mean()
-        middle = at[best] - at[best].mean()
-        moved = float(middle @ middle) + 1e-12
-        # On walls that stand askew the tip slides along them, and shows only what is across.
-        askew = float(middle @ slid) / moved / across
-        gain = across * (1.0 + askew**2) - 1.0
+        _, across, play, *_ = solutions[best].tolist()
         left = max(float(rms[best]), noise)
-        bend, sigma, told = self._bent(felt, at[best], slant[best], float(widths[best]), left)
+        rows = _rows(at[best][None], slant[best][None], widths[best : best + 1])[0]
+        askew = _askew(at[best], felt[:, 3], across)
+        (_, across, _, _, ahead, *_), _ = _on_walls(rows, felt, askew, left)
+        # A tip that climbs shows less beyond half the reach
+        away = at[best] - np.median(at[best] + felt[:, 1])
+        hard = np.sign(away) * np.maximum(np.abs(away) - self._reach / 2.0, 0.0)
+        bend, sigmas = _on_walls(np.column_stack([rows, hard]), felt, askew, left)
+        pivoted = self._two_walls and float(np.ptp(slant[best])) > PIVOTS
+        ahead, told = float(ahead / across), float(sigmas[4]) if pivoted else 1e3
         known = prior.ahead_known**2 / (prior.ahead_known**2 + told**2)
         # Walls that stand askew may be curved too: the correction is as uncertain as it is large.
-        sigma = math.hypot(sigma, askew**2)
+        sigma = math.hypot(float(sigmas[1]), askew**2)
         dead, lag = identify(cycles[:, :3])
         found = SweepFit(
-            gain, sigma, -play, float(widths[best]), float(stamps[best]), dead, lag,
+            float(across - 1.0), sigma, -play, float(widths[best]), float(stamps[best]), dead, lag,
             math.sqrt(max(float(rms[best]) ** 2 - noise**2, 0.0)), askew, noise, self._reach,
-            prior.ahead + known * ahead / across, math.sqrt(known) * told,
+            prior.ahead + known * ahead, math.sqrt(known) * told,
             *_spread(unlikely, stamps, solutions[:, 2], best),
         )  # fmt: skip
         # Play follows the model to 30 %, all else to 0.04 mm.
         beyond = 4.0 * math.hypot(prior.ahead_known, told)
-        if prior.ahead_sigma is not None and abs(ahead / across) > beyond:
+        if prior.ahead_sigma is not None and abs(ahead) > beyond:
             return found, (
-                f"the tip is {ahead / across * 1e3:+.2f} mm ahead of where earlier welds found it, "
+                f"the tip is {ahead * 1e3:+.2f} mm ahead of where earlier welds found it, "
                 f"{beyond * 1e3:.2f} mm are allowed: it was bent or changed; delete the file that "
                 "'prior' names"
             )
-        left = 0.04e-3 + noise + 0.3 * abs(play)
-        if found.unexplained > left:
+        if found.unexplained > 0.04e-3 + noise + 0.3 * abs(play):
             return found, (
                 f"gain, play and delay leave {found.unexplained * 1e3:.2f} mm of the finger's "
                 "displacement unexplained"
             )
-        return found, self._climbs(felt, at[best], gain, bend)
-
-    def _bent(
-        self, felt: Floats, at: Floats, slant: Floats, width: float, noise: float
-    ) -> tuple[tuple[float, float], float, float]:
-        """Return ((loss, sigma), gain sigma, tip-ahead sigma) of the sweep's fit.
-
-        The loss is the share by which the finger shows less displacement beyond half the reach.
-        """
-        away = at - np.median(at + felt[:, 1])
-        hard = np.sign(away) * np.maximum(np.abs(away) - self._reach / 2.0, 0.0)
-        *through, ahead = _rows(at[None], slant[None], np.array([width]))[0].T
-        rows = np.column_stack([*through, hard, ahead])
-        inverse = np.linalg.pinv(rows.T @ rows)
-        less = float((inverse @ rows.T @ felt[:, 1])[4])
-        _, gain, _, _, hardly, leads = (noise * np.sqrt(np.diag(inverse))).tolist()
-        pivoted = self._two_walls and float(np.ptp(slant)) > PIVOTS
-        return (less, hardly), gain, leads if pivoted else 1e3
+        return found, self._climbs(felt, at[best], found.gain, (bend[5], sigmas[5]))
 
     def _climbs(self, felt: Floats, at: Floats, gain: float, bend: tuple[float, float]) -> str:
         """Return a message if the tip climbs or shows less when pressed hard; else ""."""
@@ -284,6 +270,40 @@ def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple
     solutions = np.einsum("cij,cnj,n->ci", np.linalg.pinv(gram, hermitian=True), rows, felt)
     left = felt - np.einsum("cni,ci->cn", rows, solutions)
     return np.sqrt(np.mean(left**2, axis=1)), np.asarray(solutions)
+
+
+def _askew(at: Floats, along: Floats, across: float) -> float:
+    """Return the tangent by which displacements stand askew to the plan's normal, as pressed.
+
+    Args:
+        at: (N,) end point's offset [m].
+        along: (N,) displacement forwards [m].
+        across: Displacement across for one of the end point.
+    """
+    middle = at - at.mean()
+    moved = float(middle @ middle) + 1e-12
+    return float(middle @ (along - along.mean())) / moved / across
+
+
+def _on_walls(rows: Floats, felt: Floats, askew: float, noise: float) -> tuple[Floats, Floats]:
+    """Return the unknowns (K + 1,) of the sweep and of the walls' slope, and their sigmas.
+
+    A tip on walls that stand askew to the plan slides along them, and so across as well. Pressed,
+    it is off the walls' normal by the angle of friction at most, so their slope is ``askew`` give
+    or take 0.3; where friction held the tip, how it slid shows the slope.
+
+    Args:
+        rows: (N, K) design matrix of the sweep; see :func:`_rows`.
+        felt: (N, 4) time, displacement across, height, and displacement forwards.
+        askew: See :func:`_askew`.
+        noise: Standard deviation of a displacement [m].
+    """
+    rows = np.column_stack([rows, felt[:, 3] - felt[:, 3].mean()]) / noise
+    information, right = rows.T @ rows, rows.T @ felt[:, 1] / noise
+    information[-1, -1] += 0.3**-2
+    right[-1] += askew * 0.3**-2
+    covariance = np.linalg.pinv(information, hermitian=True)
+    return np.asarray(covariance @ right), np.sqrt(np.diag(covariance))
 
 
 def _spread(unlikely: Floats, stamps: Floats, plays: Floats, best: int) -> tuple[float, float]:
