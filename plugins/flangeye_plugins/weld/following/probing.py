@@ -192,11 +192,13 @@ class Probing:
         left = max(float(rms[best]), noise)
         rows = _rows(at[best][None], slant[best][None], widths[best : best + 1])[0]
         askew = _askew(at[best], felt[:, 3], across)
-        (_, across, _, _, ahead, *_), _ = _on_walls(rows, felt, askew, left)
+        # One wall alone says nothing of the tip ahead, and a leaning tool shows along as well
+        slope = askew, 0.3 if self._two_walls else 1e-3
+        (_, across, _, _, ahead, *_), _ = _on_walls(rows, felt, slope, left)
         # A tip that climbs shows less beyond half the reach
         away = at[best] - np.median(at[best] + felt[:, 1])
         hard = np.sign(away) * np.maximum(np.abs(away) - self._reach / 2.0, 0.0)
-        bend, sigmas = _on_walls(np.column_stack([rows, hard]), felt, askew, left)
+        bend, sigmas = _on_walls(np.column_stack([rows, hard]), felt, slope, left)
         pivoted = self._two_walls and float(np.ptp(slant[best])) > PIVOTS
         ahead, told = float(ahead / across), float(sigmas[4]) if pivoted else 1e3
         known = prior.ahead_known**2 / (prior.ahead_known**2 + told**2)
@@ -285,23 +287,25 @@ def _askew(at: Floats, along: Floats, across: float) -> float:
     return float(middle @ (along - along.mean())) / moved / across
 
 
-def _on_walls(rows: Floats, felt: Floats, askew: float, noise: float) -> tuple[Floats, Floats]:
+def _on_walls(
+    rows: Floats, felt: Floats, slope: tuple[float, float], noise: float
+) -> tuple[Floats, Floats]:
     """Return the unknowns (K + 1,) of the sweep and of the walls' slope, and their sigmas.
 
     A tip on walls that stand askew to the plan slides along them, and so across as well. Pressed,
-    it is off the walls' normal by the angle of friction at most, so their slope is ``askew`` give
-    or take 0.3; where friction held the tip, how it slid shows the slope.
+    it is off the walls' normal by the angle of friction at most, so their slope is known to that;
+    where friction held the tip, how it slid shows the slope.
 
     Args:
         rows: (N, K) design matrix of the sweep; see :func:`_rows`.
         felt: (N, 4) time, displacement across, height, and displacement forwards.
-        askew: See :func:`_askew`.
+        slope: Tangent of the walls' angle to the plan, with its sigma, beforehand.
         noise: Standard deviation of a displacement [m].
     """
     rows = np.column_stack([rows, felt[:, 3] - felt[:, 3].mean()]) / noise
     information, right = rows.T @ rows, rows.T @ felt[:, 1] / noise
-    information[-1, -1] += 0.3**-2
-    right[-1] += askew * 0.3**-2
+    information[-1, -1] += slope[1] ** -2
+    right[-1] += slope[0] * slope[1] ** -2
     covariance = np.linalg.pinv(information, hermitian=True)
     return np.asarray(covariance @ right), np.sqrt(np.diag(covariance))
 
