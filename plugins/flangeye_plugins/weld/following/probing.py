@@ -192,13 +192,14 @@ class Probing:
         left = max(float(rms[best]), noise)
         rows = _rows(at[best][None], slant[best][None], widths[best : best + 1])[0]
         askew = _askew(at[best], felt[:, 3], across)
-        # One wall alone says nothing of the tip ahead, and a leaning tool shows along as well
-        slope = askew, 0.3 if self._two_walls else 1e-3
-        (_, across, _, _, ahead, *_), _ = _on_walls(rows, felt, slope, left)
+        # Friction of 0.3 holds a tip off the walls' normal by as much. On one wall nothing else is
+        # taken for a slide: pressed by a leaning tool the tip moves forwards too
+        expected = askew, 0.3 if self._two_walls else 1e-3
+        (_, across, _, _, ahead, slope), _ = _on_walls(rows, felt, expected, left)
         # A tip that climbs shows less beyond half the reach
         away = at[best] - np.median(at[best] + felt[:, 1])
         hard = np.sign(away) * np.maximum(np.abs(away) - self._reach / 2.0, 0.0)
-        bend, sigmas = _on_walls(np.column_stack([rows, hard]), felt, slope, left)
+        bend, sigmas = _on_walls(np.column_stack([rows, hard]), felt, expected, left)
         pivoted = self._two_walls and float(np.ptp(slant[best])) > PIVOTS
         ahead, told = float(ahead / across), float(sigmas[4]) if pivoted else 1e3
         known = prior.ahead_known**2 / (prior.ahead_known**2 + told**2)
@@ -207,7 +208,7 @@ class Probing:
         dead, lag = identify(cycles[:, :3])
         found = SweepFit(
             float(across - 1.0), sigma, -play, float(widths[best]), float(stamps[best]), dead, lag,
-            math.sqrt(max(float(rms[best]) ** 2 - noise**2, 0.0)), askew, noise, self._reach,
+            math.sqrt(max(float(rms[best]) ** 2 - noise**2, 0.0)), float(slope), noise, self._reach,
             prior.ahead + known * ahead, math.sqrt(known) * told,
             *_spread(unlikely, stamps, solutions[:, 2], best),
         )  # fmt: skip
@@ -275,7 +276,7 @@ def _explained(at: Floats, slant: Floats, widths: Floats, felt: Floats) -> tuple
 
 
 def _askew(at: Floats, along: Floats, across: float) -> float:
-    """Return the tangent by which displacements stand askew to the plan's normal, as pressed.
+    """Return the tangent of the angle between the pressed tip's displacement and the plan's normal.
 
     Args:
         at: (N,) end point's offset [m].
@@ -288,24 +289,25 @@ def _askew(at: Floats, along: Floats, across: float) -> float:
 
 
 def _on_walls(
-    rows: Floats, felt: Floats, slope: tuple[float, float], noise: float
+    rows: Floats, felt: Floats, expected: tuple[float, float], noise: float
 ) -> tuple[Floats, Floats]:
-    """Return the unknowns (K + 1,) of the sweep and of the walls' slope, and their sigmas.
+    """Return the sweep's unknowns and the walls' slope (K + 1,), and their standard deviations.
 
-    A tip on walls that stand askew to the plan slides along them, and so across as well. Pressed,
-    it is off the walls' normal by the angle of friction at most, so their slope is known to that;
-    where friction held the tip, how it slid shows the slope.
+    A tip that slides along walls askew to the plan moves across it as well, by the walls' slope.
+    Without friction it is displaced along the walls' normal, which gives the slope. Where friction
+    holds it, its slides show the slope.
 
     Args:
         rows: (N, K) design matrix of the sweep; see :func:`_rows`.
         felt: (N, 4) time, displacement across, height, and displacement forwards.
-        slope: Tangent of the walls' angle to the plan, with its sigma, beforehand.
+        expected: The slope, tangent of the walls' angle to the plan, before the fit; its standard
+            deviation.
         noise: Standard deviation of a displacement [m].
     """
     rows = np.column_stack([rows, felt[:, 3] - felt[:, 3].mean()]) / noise
     information, right = rows.T @ rows, rows.T @ felt[:, 1] / noise
-    information[-1, -1] += slope[1] ** -2
-    right[-1] += slope[0] * slope[1] ** -2
+    information[-1, -1] += expected[1] ** -2
+    right[-1] += expected[0] * expected[1] ** -2
     covariance = np.linalg.pinv(information, hermitian=True)
     return np.asarray(covariance @ right), np.sqrt(np.diag(covariance))
 
