@@ -6,9 +6,9 @@ sample over the rooms below, each in a copy of the repository, under those fast 
 line (coverage.py says which, and is asked anew for a file of tests that has changed, into
 build/mutation), the file's own first, then the fastest: in a fork of a process that has them
 collected (tools/trying.py). A change of what is computed at import, or of a line that runs in
-processes of the tests alone, is tried in a new process as well. What the tests that are named leave
-alive is tried under the room's other files too, in a new process: coverage would make whole
-calibrations too slow. A change that fails no test is a survivor: its place and what was changed are
+processes of the tests alone, is tried in a new process as well. What the files
+named by --tests leave alive is tried under the room's other files too, in a new process: coverage
+would make whole calibrations too slow. A change that fails no test is a survivor: its place and what was changed are
 printed, and the share that was killed.
 """
 
@@ -344,7 +344,7 @@ def main() -> None:
                 continue
             tests = copy.tests(room)
             copy.collect(room)
-            alive = _survivors(copy, chosen, (tests, others), asked.budget)
+            alive = _survivors(copy, chosen, tests, others, asked.budget)
             copy.close()
             print(f"{room:10} {len(chosen) - alive:3} of {len(chosen):3} killed", flush=True)
             killed, tried = killed + len(chosen) - alive, tried + len(chosen)
@@ -352,10 +352,10 @@ def main() -> None:
 
 
 def _survivors(
-    copy: Copy, chosen: list[Mutation], known: tuple[Tests, list[str]], budget: float
+    copy: Copy, chosen: list[Mutation], tests: Tests, others: list[str], budget: float
 ) -> int:
     """Print the changes that no test notices and return how many they are."""
-    alive, (tests, others) = 0, known
+    alive = 0
     unchanged = chosen[0]._replace(change=lambda node: None)
     named = tests.of(unchanged.file, unchanged.lines, budget)
     if copy.killed_in_fork(unchanged, named) or copy.killed(unchanged, named):
