@@ -74,7 +74,7 @@ def acquire_archive(
     params: ArchiveParams,
     cell: Cell | None = None,
 ) -> Captures:
-    """Replay recorded scans and robot poses: a folder in a known layout, or a run.mcap.
+    """Replay recorded scans and robot poses: a folder in a known layout, or a run.
 
     Everything except the clouds' content is checked before the first capture. Clouds are read one
     at a time on demand, those for verification first. Recordings of a cell need ``reader: cell``.

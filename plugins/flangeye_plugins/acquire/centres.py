@@ -47,7 +47,7 @@ def acquire_centres(
     flange: Flange | None = None,
     cell: Cell | None = None,
 ) -> Observations:
-    """Take detected circle centres and robot poses from an archive or a run.mcap.
+    """Take detected circle centres and robot poses from an archive or a run.
 
     The centres go directly to the solver. There are no normals and no clouds, so steps that need
     them cannot follow. Centres of verification poses are not given to the solver. If the recipe's

@@ -42,7 +42,7 @@ from flangeye.types import (
     Warn,
 )
 from flangeye.units import param
-from flangeye.workflow.log.read import RunLog, is_log
+from flangeye.workflow.log.read import RunLog, is_log, log_of
 
 if TYPE_CHECKING:
     from flangeye.maths.kinematics import Arm
@@ -62,7 +62,7 @@ class OpeningParams(Params):
 
 
 def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
-    """Return the path of the archive; of a run's folder, its log's.
+    """Return the path of the archive; that of the log, if it is a run.
 
     Raises:
         StageError: No path is given, or it does not exist.
@@ -72,7 +72,7 @@ def archive_path(stage: str, given: ArchivePath, params: OpeningParams) -> Path:
         raise StageError(f"{stage}: no archive given; add --archive PATH, or path: in the recipe")
     if not path.exists():
         raise StageError(f"{path}: does not exist")
-    log = path / "run.mcap"
+    log = log_of(path)
     return log if is_log(log) else path
 
 

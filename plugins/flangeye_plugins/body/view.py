@@ -88,7 +88,7 @@ class CoarseImage:
         return mask, directions
 
     def _same(self, way: Floats, normals: Floats, depth: Floats, cells: int) -> Mask:
-        """Return the mask (...) of steps (..., 3) that stay on a surface, so many cells across."""
+        """Return the mask (...) of steps (..., 3), ``cells`` long, that stay on the surface."""
         # A table right behind a plate's edge is not the plate: it lies off its plane
         off = np.abs(np.einsum("...k,...k->...", way, normals))
         same = np.abs(way[..., 2]) < _gate(depth, self.angle, cells)

@@ -596,7 +596,7 @@ def test_what_all_scans_share_is_told_alone() -> None:
     diagnosis = examine(spoilt, CHECKS)
     assert diagnosis.findings == (wrong,)
     assert diagnosis.notes == (aside,)
-    known = "by itself in each of these samples: a, b"
+    known = "each of these samples shows it by itself: a, b"
     assert combined_fix(diagnosis.findings) == (wrong.what, known, ["mirror it"])
     nothing = session.centres * np.nan
     few = replace(session, centres=nothing, remarks=(aside,))

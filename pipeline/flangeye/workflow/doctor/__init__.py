@@ -73,7 +73,7 @@ def combined_fix(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
     if known:
         known = f"re-solved with the correction: {known}"
     elif together[0].samples:
-        known = f"by itself in each of these samples: {_samples(together[0])}"
+        known = f"each of these samples shows it by itself: {_samples(together[0])}"
     return wrong, known, steps
 
 
