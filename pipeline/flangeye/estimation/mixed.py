@@ -17,7 +17,6 @@ linear in N. Arrays only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -124,7 +123,8 @@ class Fit:
         root: (P + K, P + K) lower Cholesky factor of the information with the effects' prior.
         cost: -2 log of the restricted likelihood, up to a constant.
         gradient: (S,) derivatives of the cost by the logarithm of each size.
-        curvature: (S, S) second derivatives of the cost by the same logarithms.
+        curvature: (S, S) mean of the observed and the expected second derivatives of the cost by
+            the same logarithms.
     """
 
     sizes: Floats
@@ -179,7 +179,7 @@ def whitened(model: LinearModel, sizes: Floats) -> WhitenedModel:
 def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
     """Solve Henderson's mixed-model equations at (S,) sizes, with the restricted likelihood.
 
-    Computing the gradient and curvature by the sizes too takes five times as long.
+    Computing the gradient and curvature by the sizes too takes twice as long.
 
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
@@ -232,46 +232,38 @@ def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Flo
     r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
     With V the covariance of the residuals, V_i its derivatives, and :math:`P = V^{-1} - V^{-1} G
-    (G'V^{-1}G)^{-1} G'V^{-1}`, they are
+    (G'V^{-1}G)^{-1} G'V^{-1}`, the gradient is :math:`tr(P V_i) - y'P V_i P y`. The curvature is
+    the mean of the observed and the expected one, in which the costly traces cancel (average
+    information, Gilmour, Thompson & Cullis 1995):
 
-    .. math:: tr(P V_i) - y'P V_i P y, \qquad
-        tr(P V_{ij}) - y'P V_{ij} P y - tr(P V_i P V_j) + 2 y'P V_i P V_j P y
+    .. math:: y'P V_i P V_j P y + (tr(P V_{ij}) - y'P V_{ij} P y) / 2
 
-    In Henderson's terms P E = W H C / s^2 for an effect E, with C the covariance of all unknowns.
+    In Henderson's terms V_i P y is 2 E delta for an effect E, and V_i R^-1 e for the noise.
     """
     sizes, effect, p = found.sizes, model.sizes.effect, model.p
     count, n = len(sizes), len(model.residuals)
-    # Of effects, in units of their sizes
+    # By the size of each effect
     of = (np.arange(count)[:, None] == effect).astype(float)
-    scale, numbers = sizes[effect], found.mean[p:] / sizes[effect]
-    rest = np.eye(len(effect)) - found.covariance[p:, p:] / np.outer(scale, scale)
-    gradient = 2 * of @ (np.diag(rest) - numbers**2)
-    curvature = np.diag(2 * gradient)
-    curvature -= 4 * of @ (rest**2 - 2 * np.outer(numbers, numbers) * rest) @ of.T
-    # Of the noise, by each cause
-    rows, left = known.rows.reshape(n, 6, -1), left.reshape(n, 6, 1)
+    numbers, variances = found.mean[p:], np.diag(found.covariance)[p:]
+    gradient = 2 * of @ (1 - (variances + numbers**2) / sizes[effect] ** 2)
+    curvature = np.diag(gradient)
+    # By the sizes of the noise, of each of its causes
+    rows, errors = known.rows.reshape(n, 6, -1), left.reshape(n, 6, 1)
     moved = (known.rows @ found.covariance).reshape(rows.shape)
-    spread = moved @ np.swapaxes(rows, 1, 2) + left * np.swapaxes(left, 1, 2)
-    slope = np.swapaxes(known.whitening, 1, 2) @ (np.eye(6) - spread) @ known.whitening
+    spread = moved @ np.swapaxes(rows, 1, 2) + errors * np.swapaxes(errors, 1, 2)
+    back = np.swapaxes(known.whitening, 1, 2)
+    slope = back @ (np.eye(6) - spread) @ known.whitening
     amounts = sizes[model.factors].prod(axis=1)
     by_cause = amounts * (model.causes.reshape(len(amounts), -1) @ slope.ravel())
     powers = (model.factors[..., None] == np.arange(count)).sum(axis=1)
     gradient += powers.T @ by_cause
-    curvature += (powers.T * by_cause) @ powers
-    # By each two of its sizes, and by one of them and an effect's
-    own = np.flatnonzero(powers.any(axis=0))
-    changes = np.tensordot(powers[:, own].T * amounts, model.causes, axes=1)
-    changes = known.whitening @ changes @ np.swapaxes(known.whitening, 1, 2)
-    turned = (changes @ moved).reshape(len(own), 6 * n, -1)
-    crossed, drawn = np.swapaxes(turned, 1, 2) @ known.rows, left.ravel() @ turned
-    pulled = (changes @ left).reshape(len(own), -1) @ known.rows
-    both = np.tensordot((np.eye(6) - 2 * spread) @ changes, changes, axes=((1, 2, 3), (1, 3, 2)))
-    both += np.tensordot(crossed, crossed, axes=((1, 2), (2, 1))) + 2 * drawn @ pulled.T
-    curvature[np.ix_(own, own)] -= both
-    squares = (turned * moved.reshape(6 * n, -1)).sum(axis=1)[:, p:] / scale**2
-    each = 2 * (squares - 2 * numbers * drawn[:, p:] / scale) @ of.T
-    curvature[own] -= each
-    curvature[:, own] -= each.T
+    curvature += (powers.T * by_cause) @ powers / 2
+    # V_i P y in units of the noise, for each size
+    changes = np.tensordot(powers.T * amounts, model.causes @ (back @ errors), axes=1)
+    changes = (known.whitening @ changes).reshape(count, -1)
+    changes += 2 * (of * numbers) @ known.rows[:, p:].T
+    across = changes @ known.rows
+    curvature += changes @ changes.T - across @ found.covariance @ across.T
     return replace(found, gradient=gradient, curvature=curvature)
 
 
@@ -281,6 +273,18 @@ def spread_of(rows: Floats, covariance: Floats) -> Floats:
     return np.asarray(flat.reshape(rows.shape) @ np.swapaxes(rows, 1, 2))
 
 
+class Peak(NamedTuple):
+    """The most likely sizes.
+
+    Attributes:
+        z: (Z,) the sizes as standard normal values.
+        spread: (Z, Z) root of the covariance of z, from the curvature at the mode.
+    """
+
+    z: Floats
+    spread: Floats
+
+
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Joint posterior of places and effects: a mixture of Gaussians over the sizes.
@@ -288,17 +292,34 @@ class Posterior:
     Attributes:
         model: The linearised sightings.
         mode: The fit at the most likely sizes.
-        fits: One fit for each draw of the sizes.
-        chances: (F,) weights of the draws; they sum to one.
-        cost: -2 log of the restricted likelihood times the sizes' prior at the mode, up to a
-            constant.
+        peak: The most likely sizes; None for the posterior at these sizes alone.
     """
 
     model: LinearModel
     mode: Fit
-    fits: tuple[Fit, ...]
-    chances: Floats
-    cost: float
+    peak: Peak | None = None
+
+    @property
+    def cost(self) -> float:
+        """-2 log of the restricted likelihood times the prior at the mode, up to a constant."""
+        z = np.zeros(0) if self.peak is None else self.peak.z
+        return self.mode.cost + float(z @ z)
+
+    @property
+    def fits(self) -> tuple[Fit, ...]:
+        """One fit for each draw of the sizes."""
+        return self._drawn[0]
+
+    @property
+    def chances(self) -> Floats:
+        """Weights (F,) of the draws; they sum to one."""
+        return self._drawn[1]
+
+    @cached_property
+    def _drawn(self) -> tuple[tuple[Fit, ...], Floats]:
+        if self.peak is None:
+            return (self.mode,), np.ones(1)
+        return _drawn(self.model, self.peak, self.mode)
 
     @cached_property
     def mean(self) -> Floats:
@@ -313,17 +334,17 @@ class Posterior:
         return np.asarray(within + (apart.T * self.chances) @ apart)
 
     def without(self, rows: Indices) -> Posterior:
-        """Return the estimate without some sightings in closed form; variance components stay."""
-        shares, taken = self.model.shares.copy(), self.model.where(rows)
-        shares[rows] = 0.0
-        mode, *fits = _without(taken, [self.mode, *self.fits])
-        left = self.model.weighted(shares)
-        return replace(self, model=left, mode=mode, fits=tuple(fits))
+        """Return the posterior without some sightings, at the most likely sizes with them.
 
-    def refitted(self, model: LinearModel) -> Posterior:
-        """Return the estimate by another model of the sightings; variance components stay."""
-        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.fits))
-        return replace(self, model=model, mode=mode, fits=tuple(fits))
+        It is in closed form: the cost is that of the sightings left out.
+        """
+        shares, taken, at = self.model.shares.copy(), self.model.where(rows), self.mode
+        shares[rows] = 0.0
+        known = whitened(taken, at.sizes)
+        information = at.information - known.rows.T @ known.rows
+        right = at.right - known.rows.T @ known.errors
+        mode = _solved(taken, at.sizes, information, right)
+        return Posterior(self.model.weighted(shares), mode)
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
@@ -345,18 +366,6 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
-class Peak(NamedTuple):
-    """The most likely sizes.
-
-    Attributes:
-        z: (Z,) the sizes as standard normal values.
-        spread: (Z, Z) root of the covariance of z, from the curvature at the mode.
-    """
-
-    z: Floats
-    spread: Floats
-
-
 def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
     """Return the most likely sizes, searched from a start or from the prior medians."""
     prior, model = model.sizes, model.subsampled()
@@ -370,7 +379,7 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
         # Absolute values: at a saddle Newton's step would climb
         values = np.maximum(np.abs(values + 1), 0.25)
         step = -vectors @ (vectors.T @ slope / values)
-        # Of the likelihood's logarithm; what the step leaves is about the square of that
+        # Of the likelihood's logarithm; what the step leaves is far less
         if -slope @ step < 1e-3:
             z = z + step
             break
@@ -393,9 +402,9 @@ def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Flo
     return None
 
 
-def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
-    """Return the joint posterior, with the sizes marginalised by sampling about their mode."""
-    (z, spread), some, prior = mode, model.subsampled(), model.sizes
+def _drawn(model: LinearModel, peak: Peak, at_mode: Fit) -> tuple[tuple[Fit, ...], Floats]:
+    """Return fits at sizes drawn about their mode, with weights: this marginalises the sizes."""
+    (z, spread), some, prior = peak, model.subsampled(), model.sizes
     fits, logs = [], []
     # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
     # give or take 6 % from session to session
@@ -413,23 +422,7 @@ def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
             sizes[own] = at_mode.sizes[own]
             fits[k] = _solved(model, sizes, at_mode.information, at_mode.right)
     chances = np.exp(np.array(logs) - max(logs))
-    cost = at_mode.cost + float(z @ z)
-    return Posterior(model, at_mode, tuple(fits), chances / chances.sum(), cost)
-
-
-def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
-    """Yield fits without some of their sightings, each at its own sizes."""
-    # The information of a sighting depends on the noise's sizes alone, which many fits share
-    amounts = np.array([each.sizes[taken.factors].prod(axis=1) for each in fits])
-    amounts, which = np.unique(amounts, axis=0, return_inverse=True)
-    noise = taken.still + np.tensordot(amounts, taken.causes, axes=1)
-    whitening = np.sqrt(taken.shares)[:, None, None] * np.linalg.inv(np.linalg.cholesky(noise))
-    rows = (whitening @ taken.design).reshape(len(amounts), -1, taken.design.shape[2])
-    errors = (whitening @ taken.residuals[..., None]).reshape(len(amounts), -1, 1)
-    across = np.swapaxes(rows, 1, 2)
-    information, right = across @ rows, (across @ errors)[..., 0]
-    for k, each in zip(which.ravel(), fits, strict=True):
-        yield _solved(taken, each.sizes, each.information - information[k], each.right - right[k])
+    return tuple(fits), chances / chances.sum()
 
 
 def _draws(count: int, samples: int) -> Floats:

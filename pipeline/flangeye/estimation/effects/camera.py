@@ -82,7 +82,7 @@ def drift_effects(problem: Problem) -> list[Effect]:
     The target may be what drifted instead.
     """
     # Five sightings between two knots at least
-    knots = min(len(problem.seen) // 5, 12)
+    knots = min(len(problem.seen) // 5, 6)
     if knots < 2:
         return []
     cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
