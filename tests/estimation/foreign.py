@@ -107,17 +107,21 @@ def true_joints(arm: dict, q: np.ndarray, e: Errors, session: bool) -> np.ndarra
 def joints_at(arm: dict, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return joints (N, n) of (N, 4, 4) poses by Gauss-Newton from a start; NaN where it fails."""
     q = np.broadcast_to(start, (len(targets), len(arm["a"]))).copy()
+    left = np.arange(len(q))
     for _ in range(60):
-        now = pose(arm, q)
-        error = _twist(targets, now)
-        jac = np.empty((len(q), 6, q.shape[1]))
+        now = pose(arm, q[left])
+        error = _twist(targets[left], now)
+        left, now, error = (each[np.abs(error).max(axis=1) > 1e-12] for each in (left, now, error))
+        if not len(left):
+            break
+        jac = np.empty((len(left), 6, q.shape[1]))
         for i in range(q.shape[1]):
             step = np.zeros(q.shape[1])
             step[i] = 1e-6
-            jac[:, :, i] = _twist(pose(arm, q + step), now) / 1e-6
+            jac[:, :, i] = _twist(pose(arm, q[left] + step), now) / 1e-6
         jt = np.swapaxes(jac, 1, 2)
         change = (jt @ np.linalg.solve(jac @ jt + 1e-9 * np.eye(6), error[..., None]))[..., 0]
-        q = q + np.clip(change, -0.3, 0.3)
+        q[left] += np.clip(change, -0.3, 0.3)
     bad = np.abs(_twist(targets, pose(arm, q))).max(axis=1) > 1e-8
     q[bad] = np.nan
     return q
@@ -243,7 +247,7 @@ def _noisy(kind, exact, rng):
 # --- the truth of both answers ------------------------------------------------------------------
 
 
-def work(s: Session, count: int = 1000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def work(s: Session, count: int = 6000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return flange poses of the work, reported and real (N, 4, 4), over the box."""
     rng = np.random.default_rng(12345)
     targets = np.tile(np.eye(4), (count, 1, 1))

@@ -29,7 +29,7 @@ from flangeye.types.geometry import hat, invert, levers, rigid, rotation_exp, ro
 from tests.estimation import foreign
 from tests.estimation.sessions import estimated
 
-TURN = 0.02
+TURN = 0.002
 """A turn counts like what it does so far away [m]: it decides where the work is in a line."""
 
 
@@ -39,14 +39,15 @@ def session(request: pytest.FixtureRequest) -> tuple[str, Estimate, Work]:
     return request.param, found, work_of(found.problem, found.places)
 
 
-def fitted(by: Floats, moved: Floats, inside: Any) -> Floats:
-    """Return (6, K) by which (W, 6, 6) explain (W, 6, K) best, where the work is."""
-    weight = np.repeat([TURN, 1.0], 3)[:, None]
-    rows, right = ((weight * each)[inside].reshape(6 * inside.sum(), -1) for each in (by, moved))
-    return np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0])
+def fitted(by: Floats, moved: Floats, weights: Floats) -> Floats:
+    """Return (6, K) by which (W, 6, 6) explain (W, 6, K) best, with weights (W,)."""
+    own = np.repeat([TURN, 1.0], 3)
+    left = (np.swapaxes(by, 1, 2) * own**2 * weights[:, None, None]).swapaxes(0, 1).reshape(6, -1)
+    rows, right = (each.reshape(-1, each.shape[2]) for each in (by, moved))
+    return np.asarray(np.linalg.solve(left @ rows, left @ right))
 
 
-def world_of(found: Estimate, work: Work, inside: Any) -> Floats:
+def world_of(found: Estimate, work: Work, weights: Floats) -> Floats:
     """Return (6, K): by which rigid motion of the base the arm's errors displace it most alike."""
     (carrier,) = work.around.carriers
     at = np.asarray(work.around.frames["flange"].place)[work.around.seen.times, :3, 3]
@@ -63,7 +64,7 @@ def world_of(found: Estimate, work: Work, inside: Any) -> Floats:
             columns.append(np.zeros((len(at), 6, count)))
     motions = np.tile(np.eye(6), (len(at), 1, 1))
     motions[:, 3:, :3] = levers(at)[:, :, :3]
-    return fitted(motions, np.concatenate(columns, axis=2), inside)
+    return fitted(motions, np.concatenate(columns, axis=2), weights)
 
 
 def test_a_place_that_stands_is_where_the_arm_reports_it_on_average(session: Any) -> None:
@@ -78,10 +79,10 @@ def test_a_place_that_stands_is_where_the_arm_reports_it_on_average(session: Any
         e.block(work.around, linear) if e.of_camera else np.zeros((len(work.around.seen), 6, n))
         for e, n in zip(found.effects, found.counts, strict=True)
     ]
-    for told, inside in zip(every, work.boxes, strict=True):
-        expected = -about @ world_of(found, work, inside)
+    for told, weights in zip(every, work.boxes, strict=True):
+        expected = -about @ world_of(found, work, weights)
         if name == "camera":
-            expected += fitted(linear.blocks[name], np.concatenate(focal, axis=2), inside)
+            expected += fitted(linear.blocks[name], np.concatenate(focal, axis=2), weights)
         np.testing.assert_allclose(told[6 * i : 6 * i + 6], expected, rtol=1e-6, atol=1e-7)
 
 
@@ -102,9 +103,9 @@ def test_a_place_on_the_arm_takes_up_what_the_arm_does_beside(session: Any) -> N
     at = found.places[names[0]][:3, 3]
     about = np.eye(6)
     about[3:, :3] = -hat(at)
-    for told, inside in zip(commanded(found, work), work.boxes, strict=True):
-        stands = linear.blocks[names[0]] @ (-about @ world_of(found, work, inside))
-        expected = fitted(linear.blocks[names[1]], moved - stands + focal, inside)
+    for told, weights in zip(commanded(found, work), work.boxes, strict=True):
+        stands = linear.blocks[names[0]] @ (-about @ world_of(found, work, weights))
+        expected = fitted(linear.blocks[names[1]], moved - stands + focal, weights)
         rows = told[6 * carried : 6 * carried + 6]
         np.testing.assert_allclose(rows, expected, rtol=1e-5, atol=1e-6)
         # What the first joint does is a motion of the base, of which nothing is left

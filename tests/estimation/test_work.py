@@ -63,12 +63,35 @@ def test_the_work_is_where_the_session_was_and_up_to_a_few_spacings_beyond(kind:
     assert (around.min(axis=0) < low - 2.2 * spacing).all()
     assert (around.max(axis=0) > high + 2.2 * spacing).all()
     assert len(around) > 200 and work.boxes.shape == (8, len(around))
+    np.testing.assert_allclose(work.boxes.sum(axis=1), 1.0)
     within = ((around >= low) & (around <= high)).all(axis=1)
     assert work.boxes[:, within].all()
     # On average a box reaches one spacing beyond the outermost poses, less what is cut off
-    beyond = [around[inside].max(axis=0) - high for inside in work.boxes]
+    beyond = [around[weights != 0].max(axis=0) - high for weights in work.boxes]
     assert 0.4 < np.mean(beyond / spacing) < 1.1
-    assert len({int(inside.sum()) for inside in work.boxes}) > 4
+    assert len({int((weights != 0).sum()) for weights in work.boxes}) > 4
+
+
+def test_weighted_poses_stand_for_all_poses_of_a_box_better_than_as_many_even_ones() -> None:
+    problem, places = session()
+    turns = flanges(problem)[:, :3, :3]
+    middle = flanges(problem)[:, :3, 3].mean(axis=0)
+    work = work_of(problem, places, Box(middle, np.array([0.1, 0.06, 0.08])))
+    poses, (weights,) = flanges(work.poses), work.boxes
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T / np.sqrt(3)
+    # Two points of Gauss and Legendre along each edge, with each orientation at each of them
+    every = np.array([
+        rigid(turn, middle + corner * [0.1, 0.06, 0.08]) for turn in turns for corner in corners
+    ])  # fmt: skip
+
+    def bent(at: Floats) -> Floats:
+        tip = at[:, :3, :3] @ [0.1, 0.05, 0.2] + at[:, :3, 3] - middle
+        return np.column_stack([tip, tip**2, tip[:, :1] * tip[:, 1:]])
+
+    expected = bent(every).mean(axis=0)
+    off = np.abs(weights @ bent(poses) - expected)
+    even = np.abs(bent(poses).mean(axis=0) - expected)
+    assert np.linalg.norm(off) < 0.1 * np.linalg.norm(even)
 
 
 def test_a_box_that_is_stated_is_filled_evenly_with_the_session_s_orientations() -> None:
@@ -76,7 +99,7 @@ def test_a_box_that_is_stated_is_filled_evenly_with_the_session_s_orientations()
     middle = flanges(problem)[:, :3, 3].mean(axis=0)
     box = Box(middle, np.array([0.1, 0.06, 0.08]))
     work = work_of(problem, places, box)
-    assert work.poses is work.around and work.boxes.all()
+    assert work.poses is work.around
     require_predicted(work.poses, places)
     poses = flanges(work.poses)
     assert len(poses) == 256 and work.boxes.shape == (1, 256)

@@ -92,7 +92,7 @@ def as_reported(found: Estimate, work: Work) -> Answer:
 
 def commanded(found: Estimate, work: Work) -> Floats:
     """Return (B, P, K): how the effects move the places in reported coordinates, for each box."""
-    return _Commands(found, work.around, work.boxes.astype(float)).answer()
+    return _Commands(found, work.around, work.boxes).answer()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class _Commands:
     Attributes:
         found: The posterior.
         work: W predicted sightings over the work.
-        boxes: (B, W) 1 for the sightings in each possible work box.
+        boxes: (B, W) weights with which the sightings stand for each possible work box.
     """
 
     found: Estimate
@@ -159,8 +159,9 @@ class _Commands:
     def _explained(self, by: Floats, moved: Floats) -> Floats:
         """Return (B, 6, K): twists ``moved`` (W, 6, K), fitted over each box by least squares."""
         # Turns count like what they do so far from the flange [m]: enough to determine the turn
-        # about a line where the work is in one, and no more, for the work is at positions
-        weight = np.repeat([0.02, 1.0], 3)[:, None]
+        # about a line where the work is in one, and no more, for the work is at positions.
+        # With ten times as much, those of an arm of 3 mrad move the answer by its stated error
+        weight = np.repeat([0.002, 1.0], 3)[:, None]
         across = np.swapaxes(weight**2 * by, 1, 2)
         gram, right = (np.tensordot(self.boxes, across @ each, axes=1) for each in (by, moved))
         return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)

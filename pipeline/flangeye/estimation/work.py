@@ -11,8 +11,8 @@ from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import spread_evenly
 from flangeye.models.cell import composed
-from flangeye.types import Box, Floats, Mask
-from flangeye.types.geometry import invert
+from flangeye.types import Box, Floats
+from flangeye.types.geometry import invert, skew_parts
 
 COUNT = 256
 """Number of simulated poses; twice as many change the expected error by less than a tenth."""
@@ -25,12 +25,12 @@ class Work:
     Attributes:
         poses: Predicted sightings at new poses, at which the expected error is evaluated.
         around: Predicted sightings all over the widest possible work box.
-        boxes: (B, W) which sightings of ``around`` are in each possible work box.
+        boxes: (B, W) weights with which sightings of ``around`` stand for each possible work box.
     """
 
     poses: Problem
     around: Problem
-    boxes: Mask
+    boxes: Floats
 
 
 def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
@@ -53,34 +53,59 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     # One arm's flange can be sent to new poses; a rail goes along its line, and all else stays
     if carrier is None or carrier.link is not None or carrier.axis:
         return _all_of(session)
+    poses = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times]
+    rotations = poses[:, :3, :3]
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
-        return _all_of(_simulated(_in_box(problem, carrier, sides), places))
-    at = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times, :3, 3]
-    inner = np.array([at.min(axis=0), at.max(axis=0)])
+        filled = _simulated(_in_box(problem, carrier, sides), places)
+        return Work(filled, filled, _weights(filled, rotations, sides)[None])
+    inner = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
     outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
     widest = 2.5  # spacings of poses that a box reaches beyond these
     wide = _simulated(_in_box(problem, carrier, inner + widest * outward), places)
     # Eight boxes that the poses may have been drawn from, equally likely: from the outermost of n
     # evenly drawn poses to the box's side the distance is exponential, with the spacing as mean
     beyond = np.random.default_rng(0).exponential(size=(8, 2, 3)).clip(max=widest)
-    return Work(session, wide, np.array([_inside(wide, inner + b * outward) for b in beyond]))
+    boxes = [_weights(wide, rotations, inner + each * outward) for each in beyond]
+    return Work(session, wide, np.array(boxes))
 
 
 def _all_of(work: Problem) -> Work:
-    return Work(work, work, np.ones((1, len(work.seen)), dtype=bool))
+    return Work(work, work, np.full((1, len(work.seen)), 1 / len(work.seen)))
 
 
 def _simulated(work: Problem, places: Places) -> Problem:
     return replace(work, seen=_predicted(work, places))
 
 
-def _inside(work: Problem, box: Floats) -> Mask:
-    """Return the mask (W,) of sightings with the flange in a box (2, 3); all if none have."""
-    places = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times, :3, 3]
-    inside = np.asarray(((places >= box[0]) & (places <= box[1])).all(axis=1))
+def _weights(work: Problem, rotations: Floats, box: Floats) -> Floats:
+    """Return weights (W,) with which sightings stand for all poses in a box (2, 3).
+
+    The box has each orientation of the session (N, 3, 3) at each place. The sightings in it are
+    weighted evenly, and then as little otherwise as gives places, turns, and the products of any
+    two the means that they have over the box: so 256 sightings are as good as thousands.
+    """
+    poses = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times]
+    half = (box[1] - box[0]) / 2
+    at = (poses[:, :3, 3] - box.mean(axis=0)) / np.where(half > 0, half, np.inf)
+    inside = (np.abs(at) <= 1 + 1e-9).all(axis=1)
     # A box without any reachable pose must still give an average
-    return inside if inside.any() else ~inside
+    inside = inside if inside.any() else ~inside
+    middle = rotations.mean(axis=0)
+    turns, every = (skew_parts(each @ middle.T) for each in (poses[:, :3, :3], rotations))
+    numbers = np.hstack([np.ones((len(at), 1)), at, turns])[inside]
+    # Places are even between -1 and 1 where the arm reaches all of them, and independent of turns
+    means = np.diag([1.0, *[1 / 3] * 3, 0.0, 0.0, 0.0])
+    if len(poses) < COUNT:
+        means[:4, :4] = numbers[:, :4].T @ numbers[:, :4] / len(numbers)
+    means[:4, 4:] = np.outer(means[0, :4], every.mean(axis=0))
+    means[4:, 4:] = every.T @ every / len(every)
+    pairs = np.triu_indices(7)
+    products = numbers[:, pairs[0]] * numbers[:, pairs[1]]
+    off = means[pairs] - products.mean(axis=0)
+    weights = inside / len(numbers)
+    weights[inside] += np.linalg.lstsq(products.T, off, rcond=1e-6)[0]
+    return np.asarray(weights)
 
 
 def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:

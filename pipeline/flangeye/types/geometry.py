@@ -35,6 +35,15 @@ def hat(vectors: ArrayLike) -> Floats:
     return out
 
 
+def skew_parts(matrices: Floats) -> Floats:
+    """Return the (..., 3) vectors v of (..., 3, 3) matrices M with ``hat(v) = (M - M.T) / 2``.
+
+    Of a rotation it is the axis times the sine of the angle.
+    """
+    apart = matrices - np.swapaxes(matrices, -1, -2)
+    return np.asarray(apart[..., (2, 0, 1), (1, 2, 0)] / 2)
+
+
 def rotation_exp(vectors: ArrayLike) -> Floats:
     """Return the rotations of rotation vectors, (..., 3) [rad] -> (..., 3, 3) (Rodrigues)."""
     phi = np.asarray(vectors, dtype=np.float64)

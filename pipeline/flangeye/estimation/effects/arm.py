@@ -20,7 +20,7 @@ from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
 from flangeye.maths.kinematics import Arm
 from flangeye.types import Floats, SmoothField
-from flangeye.types.geometry import hat
+from flangeye.types.geometry import hat, skew_parts
 
 ARM_ERRORS = {
     "zeros": ("joint zeros", 1.0),
@@ -196,9 +196,8 @@ def _bent(arm: str, session: Floats) -> Block:
         out = np.zeros((len(problem.seen), 6, 36))
         for c in (c for c in problem.carriers if c.arm == arm):
             poses = np.asarray(problem.frames[c.frame].place)[problem.seen.times]
-            twice = poses[:, :3, :3] @ turned.T
-            skew = (twice - np.swapaxes(twice, 1, 2))[:, (2, 0, 1), (1, 2, 0)] / 2
-            by = np.stack([poses[:, :3, 3] - middle, skew], axis=1)
+            turns = skew_parts(poses[:, :3, :3] @ turned.T)
+            by = np.stack([poses[:, :3, 3] - middle, turns], axis=1)
             # Each of the twist's six numbers by the six of the pose
             sizes = np.repeat(changes, 3, axis=0)[:, :, None] * by[:, None]
             rows = np.eye(6)[:, :, None] * sizes.reshape(len(by), 1, 6, 6)
