@@ -83,7 +83,7 @@ def test_a_vendors_plugin_is_found_and_runs(flangeye: Callable[..., Any], tmp_pa
 def test_a_cost_of_ones_own_is_minimised(flangeye: Callable[..., Any], tmp_path: Path) -> None:
     recipe = tmp_path / "cost.yaml"
     recipe.write_text(
-        "title: A cost of one's own\n"
+        "title: A cost of your own\n"
         "steps:\n"
         "  - acquire.points_as_in_paper: {noise: 0.1 mm}\n"
         "  - solve.iterative: {error: holdout, reserve: 8, cost: acme_largest_axis, "

@@ -28,7 +28,7 @@ WORDS = {
     "acquire.simulated": "Take simulated scans", "acquire.live": "Move the arm and scan",
     "acquire.archive": "Read recorded scans", "acquire.samples": "Read recorded samples",
     "segment.flange": "Find the flange", "fit.rim": "Measure its rim",
-    "solve.robust": "Find where the scanner stands", "verify.holdout": "Check on poses held out",
+    "solve.robust": "Estimate the scanner's pose", "verify.holdout": "Check on held-out poses",
 }  # fmt: skip
 """Plain names of the most common steps; others show their summary."""
 
@@ -393,7 +393,7 @@ class RunningDevices:
     def __init__(self, project: Project, form: Form) -> None:
         self._project, self._form = project, form
         self._chosen: dict[str, str] = {}
-        button = ui.button("Look at what runs", on_click=self._look).props("outline no-caps")
+        button = ui.button("Find running devices", on_click=self._look).props("outline no-caps")
         button.tooltip("Listens for a few seconds; publishes nothing and calls no service")
         self._rows = ui.column().classes("w-full gap-1")
 

@@ -62,7 +62,7 @@ def place_chart(places: Mapping[str, list[float]], aside: Set[str]) -> dict[str,
 
 
 def coverage_drawing(found: Coverage) -> str:
-    """Return an SVG: the cells of the work, layer by layer from above, and the turns."""
+    """Return an SVG: the workspace's cells, layer by layer from above, and the rotations."""
     layers = "".join(_layer(found, i) for i in range(3))
     turns = "".join(_turn(found, i) for i in range(3))
     return (

@@ -196,7 +196,7 @@ SHOT = (160, 120)
 
 
 def picture_of(cloud: Floats, flange: Floats) -> str:
-    """Return a scan as its camera sees it, near light and far dark, its flange blue: a data URL."""
+    """Return a data URL of the scan as the camera sees it: near is light, the flange is blue."""
     image = np.zeros((SHOT[1], SHOT[0], 3), dtype=np.uint8)
     if len(cloud):
         rays = cloud[:, :2] / cloud[:, 2:]

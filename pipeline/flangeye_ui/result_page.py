@@ -227,7 +227,7 @@ def _number(facts: Facts) -> None:
     if p95 is not None:
         ui.label(f"95 % of errors are below {rounded_mm(p95)} mm")
     if limit is not None:
-        ui.label(f"limit of the recipe: {rounded_mm(limit)} mm, rms on poses held out")
+        ui.label(f"limit of the recipe: {rounded_mm(limit)} mm rms on held-out poses")
 
 
 def limit_of(facts: Facts) -> float | None:
@@ -239,7 +239,7 @@ def limit_of(facts: Facts) -> float | None:
 def _by_pose(facts: Facts) -> None:
     """Show the error of each pose; a click on one opens its scan."""
     found = next((v.errors for v in facts.result.verifications.values() if v.errors), None)
-    what = "Error of each pose, held out" if found else "Residual of each pose"
+    what = "Held-out error of each pose" if found else "Residual of each pose"
     ui.label(what).classes("part").props('role="heading" aria-level="2"')
     aside = {each.id: each.reason or "not used" for each in facts.set_aside}
     chart = residual_chart(found or facts.residuals, aside, limit_of(facts))

@@ -139,7 +139,7 @@ SCANNED: dict[str, View] = {
 
 
 class Scene3D(ui.scene):
-    """A scene with axes and views to choose from; of a cell also with a floor in squares."""
+    """A scene with axes and selectable views; a cell's scene also shows a floor grid."""
 
     def __init__(
         self,
@@ -183,7 +183,7 @@ class Scene3D(ui.scene):
             for name in self._of:
                 button = ui.button(name, on_click=lambda name=name: self.look(name))
                 button.props("flat dense no-caps")
-            ui.label(f"{scale}axes: {1e3 * BASE_AXES:.0f} mm; drag to turn").classes("note")
+            ui.label(f"{scale}axes: {1e3 * BASE_AXES:.0f} mm; drag to rotate").classes("note")
 
     def wipe(self) -> None:
         """Remove everything except the axes."""

@@ -370,7 +370,7 @@ CASES = [
     ),
     (
         "error",
-        "test_a_candidate_that_is_off_is_off_by_so_much",
+        "test_a_translation_error_is_reported_in_metres",
         bad.error(lambda s: 2 * s),
         "for an error of 3 mm the part reports 6",
         {},

@@ -29,7 +29,7 @@ def test_what_runs_is_chosen_by_a_click(
     try:
         page = opened(browser, served)
         page.get_by_text("Does it run under ROS 2?").click()
-        look = page.get_by_role("button", name="Look at what runs")
+        look = page.get_by_role("button", name="Find running devices")
         look.click()
         page.get_by_text("The scans: none runs").wait_for()
         cameras = [

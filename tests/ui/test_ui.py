@@ -827,7 +827,7 @@ def test_a_bar_of_the_chart_opens_the_scan_of_its_pose(
 ) -> None:
     page = opened(browser, served)
     page.goto(f"{page.url}result?run={finished.name}")
-    bars = page.get_by_role("img", name="Error of each pose, held out")
+    bars = page.get_by_role("img", name="Held-out error of each pose")
     bars.wait_for()
     page.wait_for_timeout(1000)
     box = bars.bounding_box()

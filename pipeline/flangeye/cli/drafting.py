@@ -46,8 +46,8 @@ ANSWER_HELP = {
     "trajectory": "With --ros2: topic of the controller that moves the arm, or none.",
     "scans": "With --ros2: topic of clouds, depth images or images.",
     "trigger": "With --ros2: service that takes a scan, or none.",
-    "view": "With --ros2: where the scanner, or a camera in hand's target, roughly stands: "
-    "'620, 0, 980 mm'.",
+    "view": "With --ros2: rough position in the base of the scanner, or of a camera in "
+    "hand's target: '620, 0, 980 mm'.",
     "box": "With --ros2: box that the flange may move in, centre; size: '450, 0, 300; 600, 600, "
     "600 mm'.",
 }

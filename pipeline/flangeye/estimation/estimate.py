@@ -52,7 +52,7 @@ class Estimate:
 
     @property
     def fit(self) -> Fit:
-        """The fit at the most likely sizes."""
+        """The fit at the most likely standard deviations of effects and noise."""
         return self.posterior.mode
 
     def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
@@ -67,7 +67,7 @@ class Estimate:
         return out
 
     def outgrown(self, kind: str, deviations: float = 2.0) -> bool:
-        """Whether an effect's estimated size exceeds its prior by so many standard deviations."""
+        """Whether an effect's estimated size exceeds its prior median by ``deviations`` (sigma)."""
         sizes = self.posterior.mode.sizes
         return any(
             np.log(sizes[k] / effect.size) > deviations * np.log(effect.factor)
@@ -97,7 +97,7 @@ class Estimate:
 def prior_of(
     effects: Sequence[Effect], counts: Sequence[int], scaled: int, scatters: Sequence[Scatter]
 ) -> SizePrior:
-    """Return the prior of the sizes of effects and noise; those of one cause share its quality."""
+    """Return the prior of the sizes of effects and noise; sizes of one cause are correlated."""
     # By how many times features may be better or worse than their fits state, one sigma: turns
     # and shifts, of whole poses along the line of sight and across it apart, for there cameras
     # differ most.
@@ -231,7 +231,7 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
 
 
 def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:
-    """Return (N,) squared distances from the others' prediction, and the mask of inliers."""
+    """Return (N,) whitened squared leave-one-out residuals, and the mask of inliers."""
     noise, q = model.noise(found.sizes), model.projectors
     left, spread = left_out(model, found)
     covariance = q @ (noise + spread) @ q + (np.eye(6) - q)

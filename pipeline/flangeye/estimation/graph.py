@@ -214,7 +214,7 @@ class Problem:
         return Linear(residuals, turns, blocks)
 
     def following(self, carrier: Carrier) -> Linear:
-        """Return the linearisation whose blocks give twists (N, 6) of one carrier's own frame."""
+        """Return a linearisation in which only one carrier's frame moves: its twists (N, 6)."""
         eye = np.tile(np.eye(6), (len(self.seen), 1, 1))
         blocks = {c.frame: eye * (c is carrier) for c in self.carriers}
         return Linear(np.zeros(0), np.zeros(0), blocks)
@@ -230,7 +230,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Sightings predicted at given places, and their derivatives.
+    """Predicted sightings at given places, and their derivatives.
 
     Attributes:
         residuals: (N, 6) measured minus predicted, in ``camera`` [rad, m].

@@ -1,4 +1,4 @@
-r"""A linear mixed model: unknown places, random effects, and the sizes of both effects and noise.
+r"""A linear mixed model: unknown places, random effects, and standard deviations ("sizes").
 
 The N sightings leave residuals of six numbers each (rotation before translation),
 
@@ -50,7 +50,7 @@ class SizePrior:
     effect: np.ndarray
 
     def at(self, z: Floats) -> Floats:
-        """Return the (S,) sizes at standard normal values (Z,)."""
+        """Return the (S,) sizes (standard deviations) at standard normal values (Z,)."""
         return np.asarray(np.exp(self.centre + self.mix @ z))
 
 
@@ -367,7 +367,7 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
 
 
 def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
-    """Return the most likely sizes, searched from a start or from the prior medians."""
+    """Return the posterior mode of the sizes, searched from ``start`` or the prior medians."""
     prior, model = model.sizes, model.subsampled()
     z = np.zeros(prior.mix.shape[1]) if start is None else start
     here = fit(model, prior.at(z), with_slopes=True)
@@ -393,7 +393,7 @@ def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
 
 
 def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Floats, Fit] | None:
-    """Return likelier sizes along a step, with their fit; None if none are found."""
+    """Return more likely sizes along a step, with their fit; None if none are found."""
     for part in 0.5 ** np.arange(10):
         at = z + part * step
         there = fit(model, model.sizes.at(at), with_slopes=True)

@@ -1,4 +1,4 @@
-r"""Find which reading of arm and marker poses (inverted, exchanged) is meant if all fit alike.
+r"""Select the reading of arm and marker poses (inverted, exchanged) if several fit alike.
 
 Every sample satisfies :math:`P C = S M`: :math:`P` is the arm's pose, :math:`C` the carried frame
 in the flange, :math:`S` the fixed frame in the base, and :math:`M` the measured pose from the fixed
@@ -162,7 +162,7 @@ def _off_axis(places: Floats) -> float:
 
 
 def other_axes(places: Floats) -> Axes | None:
-    """Return camera axes in which places (N, 3) lie in view; None if they do as they are."""
+    """Return the camera axes that bring places (N, 3) into view; None if they already are."""
     off = {name: _off_axis(places @ optical(name).T) for name in get_args(Axes)}
     name: Axes = min(off, key=off.__getitem__)
     before = np.radians(40)  # as far from its axis as a wide camera sees

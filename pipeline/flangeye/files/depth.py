@@ -1,4 +1,4 @@
-"""Read scans: clouds, and depth images with the calibration of their camera beside them."""
+"""Read scans: clouds, and depth images whose camera calibration is in the same folder."""
 
 import math
 from collections.abc import Callable, Mapping

@@ -34,7 +34,7 @@ def busy() -> str:
 
 
 def require_memory(what: str, megabytes: int = 256) -> None:
-    """Require that the process can be given so much more memory; none of it is used.
+    """Require that the process can allocate more memory; the test allocation is freed at once.
 
     Raises:
         MemoryError: The memory is not available; the message begins with ``what``.

@@ -66,7 +66,7 @@ class SensorPart(Protocol):
 
 
 class ArcPart(Protocol):
-    """``arc``: opens a welding power source; its parameters are :class:`ArcTimes` and its own."""
+    """``arc``: opens a welding power source; its parameters extend :class:`ArcTimes`."""
 
     def __call__(self) -> Arc:
         """Return the open power source, gas and arc off."""

@@ -100,7 +100,7 @@ class Finger(FingerGeometry):
     """Calibrated geometry of a tactile finger and its torch, with standard deviations."""
 
     torch_sigma: Length = param("0.05 mm", ge=0)
-    """Standard deviation of the torch across the tool."""
+    """Standard deviation of the torch's position across the tool."""
     along_sigma: Length = param("0.3 mm", ge=0)
     """Standard deviation of the distance from the torch to the tip."""
     tip_sigma: Length = param("0.1 mm", ge=0)

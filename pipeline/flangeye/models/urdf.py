@@ -221,7 +221,7 @@ class UrdfBodies:
                     yield index, mesh.apply_transform(pose @ origin_of(self.urdf.path, body))
 
     def without(self) -> list[str]:
-        """Return the moved links without a body of their own or on a link fixed to them."""
+        """Return the moving links that have no collision body, and none on a link fixed to them."""
         bodies: dict[int, list[str]] = {}
         for link, index, _ in self.links():
             of = self.urdf.links.get(link)

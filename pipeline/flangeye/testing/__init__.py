@@ -201,7 +201,7 @@ class ErrorConformance(Conformance):
             off < 0.1e-3, f"for the true pose the part reports an error of {1e3 * off:.3f} mm off"
         )
 
-    def test_a_candidate_that_is_off_is_off_by_so_much(self) -> None:
+    def test_a_translation_error_is_reported_in_metres(self) -> None:
         """A candidate that is off by 3 mm has an error of 0.003 m at the work."""
         candidate = TRUE_CAMERA.copy()
         candidate[:3, 3] += [1e-3, -2e-3, 2e-3]

@@ -109,7 +109,7 @@ class FlangeCloud:
 
     @property
     def alone(self) -> list[FlangeCloud]:
-        """The fit with each single pose that explains the scan."""
+        """The same fit with one pose only, for each pose that explains the scan."""
         poses = (self.camera_T_target, *self.others)
         return [replace(self, camera_T_target=each, others=self.others[:0]) for each in poses]
 

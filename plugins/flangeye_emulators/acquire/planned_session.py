@@ -44,7 +44,7 @@ class SessionParams(ArmsParams):
     spread: Angle = param("17 deg", gt=0)
     """Largest change of a joint from there."""
     camera: PlaceParams | None = None
-    """The camera's true place in what carries it; by default wherever it has to be to see the
+    """True pose of the camera in the frame that carries it; by default, such that it sees the
     target at the first pose."""
     place: PlaceParams = Field(default_factory=PlaceParams)
     """The target's true place in what carries it, where the recipe does not know it; with camera it

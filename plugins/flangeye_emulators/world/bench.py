@@ -26,14 +26,14 @@ BENCH_MARGIN = 0.25
 
 
 CLUTTER = 6
-"""Things that lie about on the bench."""
+"""Clutter on the bench."""
 
 
 class LaidParams(Params):
     """The true pose of a workpiece."""
 
     workpiece: WorkpiecePath = param("v-straight")
-    """One of data/workpieces, or a .yaml file of one's own."""
+    """One of data/workpieces, or a .yaml file of your own."""
     position: tuple[Length, Length, Length] = param(("600 mm", "0 mm", "250 mm"))
     """Position of the workpiece's CAD origin in the base."""
     rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "20 deg"))

@@ -99,7 +99,7 @@ class LiveParams(Params):
     """Joint angles of the arm before a run; a plan that does not ask the arm (--offline) begins
     there."""
     moved: Length = param("0.05 mm", gt=0)
-    """A scan during which the flange moved by more is set aside."""
+    """Largest motion of the flange during a scan; a scan with more is rejected."""
 
 
 @stage("acquire.live")

@@ -215,7 +215,7 @@ class Looks(Shape):
         return np.linalg.eigh(weighted.T @ jacobian / len(points))
 
     def twins(self, pose: Floats) -> Floats:
-        """Return a pose turned by the rotations of a cube (K, 4, 4), which often look alike."""
+        """Return the pose after each rotation of a cube (K, 4, 4): they often look alike."""
         middle = self.surface.points.mean(axis=0)
         out = np.tile(np.eye(4), (len(QUARTERS), 1, 1))
         out[:, :3, :3] = QUARTERS

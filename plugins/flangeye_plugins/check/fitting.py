@@ -95,7 +95,7 @@ def fit(equations: Equations) -> VariantFits:
 
 
 def errors_at(equations: Equations, unknowns: VariantUnknowns) -> Floats:
-    """Return (K, N, B) lengths of every kind of error at given unknowns [m, rad]."""
+    """Return (K, N, B) error magnitudes of K variants and N samples, by kind of error [m, rad]."""
     blocks = _blocks(equations, unknowns)
     lengths = [np.linalg.norm(block.residuals, axis=-1) for block in blocks]
     return np.stack(np.broadcast_arrays(*lengths), axis=-1)
@@ -297,11 +297,11 @@ def arm_possessive(arms: Arms, session: RecordedSession) -> str:
 
 
 HELPS = 0.7
-"""A correction that explains the samples leaves at most this share of the errors held out."""
+"""Largest ratio of held-out errors with and without a correction that counts as a cause."""
 
 
 MISFIT_SHARE = 0.2
-"""Largest error held out that a correction may leave, as a share of the samples' spread."""
+"""Largest held-out error that a correction may leave, as a share of the samples' spread."""
 
 
 class Significance(NamedTuple):

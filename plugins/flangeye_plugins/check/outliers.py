@@ -205,7 +205,7 @@ def _missing(session: RecordedSession, needs: bool, spread: float, axes: float) 
     if needs and spread < LITTLE:
         return f"the poses turn by {np.degrees(spread):.2g} deg at most"
     if needs and axes < LITTLE:
-        return f"all turns are about one axis, others are {np.degrees(axes):.2f} deg at most"
+        return f"all turns are about one axis, at most {np.degrees(axes):.2f} deg about any other"
     return f"the {int(session.seen.sum())} places of the target are nearly on a line"
 
 

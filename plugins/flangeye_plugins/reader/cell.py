@@ -79,7 +79,7 @@ class AxisTableParams(JoinedParams, TimesParams):
     """Columns of a rail's or positioner's pose, as its controller reports it."""
 
     column: Column
-    """Column of the value."""
+    """Column of the axis's reported value: a position or an angle."""
     unit: Literal["m", "mm", "rad", "deg"]
     """Unit of the value."""
 

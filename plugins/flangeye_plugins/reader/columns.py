@@ -98,8 +98,8 @@ class ColumnsParams(TimesParams, WrittenParams):
     """Columns and notation of a pose."""
 
     columns: tuple[Column, ...] = ()
-    """Names in the heading, or numbers from 1, in the order of the convention: position first; of
-    JSON and YAML also a list's, by its own name; all that nothing else takes if not given."""
+    """Names of the columns, or numbers from 1, in the convention's order, position first. In JSON
+    and YAML also the name of a list. By default all columns that no other parameter names."""
 
 
 class FlangePoseParams(ColumnsParams):
@@ -113,7 +113,7 @@ class SeenPoseParams(ColumnsParams):
     """A target measured by a camera; empty cells and an all-zero pose mean not seen."""
 
     pose: Literal["camera_T_target", "target_T_camera"] = "camera_T_target"
-    """Whose pose it is. rotation: point gives its place alone."""
+    """Pose that the columns hold; with rotation: point, only a position."""
 
     @classmethod
     def more(cls) -> tuple[str, ...]:

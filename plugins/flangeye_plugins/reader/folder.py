@@ -260,7 +260,7 @@ def _unit_of(file: Path, heading: Sequence[str]) -> LengthUnit | None:
     if second and _unit_stated(second) != unit:
         wanted = ", ".join(SECOND + name for name in _POSITIONS[unit])
         raise StageError(
-            f"{file}:1: the second arm's columns {wanted} are missing; they have the first's unit"
+            f"{file}:1: the second arm's columns {wanted} are missing; both arms have one unit"
         )
     return unit
 

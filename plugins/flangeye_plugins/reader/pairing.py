@@ -29,7 +29,7 @@ class PairingParams(Params):
     """Parameters for pairing poses with measurements."""
 
     clock_offset: Duration | None = None
-    """To add to the camera's times to come to the arm's; estimated if not given."""
+    """Offset from the camera's times to the arm's, to be added; estimated if not given."""
     tolerance: Duration = param("100 ms", gt=0)
     """Largest time between a measurement and the arm's next pose."""
 

@@ -55,7 +55,7 @@ class BagParams(Params):
     camera_info: str | None = None
     """Topic of the images' CameraInfo."""
     base: str | None = None
-    """Frame of the arm's base, in which its poses are."""
+    """Frame of the arm's base, in which its poses are given."""
     flange: str | None = None
     """Frame of the flange, origin in its face."""
     robot: str | None = None
@@ -64,7 +64,7 @@ class BagParams(Params):
     joints: tuple[str, ...] = ()
     """Names of the joints from base to flange, where JointState mixes them."""
     target: str | None = None
-    """The target as somebody has measured it: a PoseStamped topic, or a frame of tf with camera."""
+    """Recorded poses of the target: a PoseStamped topic, or a frame of tf, together with camera."""
     camera: str | None = None
     """The camera's frame, for a target in tf."""
     join: PairingParams = param(PairingParams())
@@ -416,8 +416,8 @@ def _seen(bag: Bag, params: BagParams) -> tuple[Target | Scans, str]:
     images = bag.only("images", params.images, Type.IMAGE, Type.COMPRESSED)
     if clouds is None and images is None:
         raise StageError(
-            f"{bag.path}: holds neither clouds nor images; name the target where somebody has "
-            "measured it (a PoseStamped topic, or a frame of tf)"
+            f"{bag.path}: holds neither clouds nor images; name the recorded poses of the "
+            "target (a PoseStamped topic, or a frame of tf)"
         )
     info = _info(bag, params, images) if images else None
     told = " and ".join(topic for topic in (clouds, images) if topic)

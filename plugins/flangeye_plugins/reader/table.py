@@ -89,8 +89,8 @@ class TableParams(FlangePoseParams, JointsParams, CloudUnitParams):
     FILE:PART, an array or a block of it, or FILE:1/2, half of its rows; a pattern of files with a
     row each, poses/*.json; or several, side by side."""
     rotation: str = BY_JOINTS
-    """How the rotations are written, see below; joints: there are the joint angles alone, and the
-    recipe's robot gives the poses."""
+    """How the rotations are written, see below; joints: the table has joint angles alone, and the
+    poses follow from the recipe's robot."""
     length: PoseLength = "m"
     """Unit of the positions."""
     scan: Column | None = None

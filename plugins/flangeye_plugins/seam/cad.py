@@ -28,7 +28,7 @@ class CadParams(SeamParams):
     """Parameters of ``seam.cad``."""
 
     workpiece: WorkpiecePath
-    """One of data/workpieces, or a .yaml file of one's own with CAD and seams."""
+    """One of data/workpieces, or a .yaml file of your own with CAD and seams."""
     seam: str | None = None
     """Name of the seam, if the workpiece has several."""
     model_error: Length = param("0.05 mm", ge=0)

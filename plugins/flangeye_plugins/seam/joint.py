@@ -49,7 +49,7 @@ class JointParams(SeamParams):
     line: tuple[tuple[Length, Length, Length], ...] | None = Field(None, min_length=2)
     """Rough points along the seam in base, in welding order; else an earlier seam."""
     closed: bool = False
-    """The line comes back to its first point."""
+    """Whether the line is closed: it returns to its first point."""
     reach: Length = param("15 mm", gt=0)
     """Largest distance of the seam and its ends from the line."""
     max_residual: Length = param("0.5 mm", gt=0)

@@ -42,7 +42,7 @@ class JointPlace:
 def rough_path(
     local: Floats, normals: Floats, joints: tuple[JointShape, ...], tolerance: float, reach: float
 ) -> list[list[JointPlace]]:
-    """Return the best paths of a joint along the line, best first; each has a place in most slabs.
+    """Return the best paths of a joint along the line, best first.
 
     Args:
         local: (N, 3) scan points along, across and out of the rough line [m].

@@ -237,7 +237,10 @@ def _ambiguous(discs: list[Disc]) -> str:
     places = " and ".join(
         "(" + ", ".join(f"{c * 1e3:.0f}" for c in disc.centre) + ") mm" for disc in discs
     )
-    return f"{len(discs)} discs look like the flange: at {places}; hide one or narrow near and far"
+    return (
+        f"{len(discs)} discs look like the flange: at {places}; "
+        "hide all but one, or narrow near and far"
+    )
 
 
 def _why_none(discs: list[Disc], flange: Flange) -> str:

@@ -231,7 +231,9 @@ def _why_not(
             "(" + ", ".join(f"{c * 1e3:.0f}" for c in candidate.centre) + ") mm"
             for candidate in fitting
         )
-        return f"{len(fitting)} spheres {size}: at {places}; hide one or narrow near and far"
+        return (
+            f"{len(fitting)} spheres {size}: at {places}; hide all but one, or narrow near and far"
+        )
     best = found[0].seen if found else 0.0
     return (
         f"no sphere {size}: of the best candidate's face {best:.0%} is there, at least "

@@ -34,7 +34,7 @@ class CadCloud(Params):
     unit: LengthUnit
     """Unit of the file's coordinates."""
     offset: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
-    """Origin of the file's frame in the flange's."""
+    """Position of the file's origin in the flange's frame."""
     rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "0 deg"))
     """Roll, pitch, yaw of the file's frame."""
 

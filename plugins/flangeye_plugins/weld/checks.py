@@ -40,7 +40,8 @@ def check_finger(finger: Finger, settings: Following) -> None:
     if force is not None and force > finger.largest_force:
         raise StageError(
             f"weld.tactile: deflection and preload press with {force:.2g} N, limit "
-            f"{finger.largest_force:.2g} N; lower them, or raise 'largest_force' in its file"
+            f"{finger.largest_force:.2g} N; lower them, or raise 'largest_force' "
+            "in the finger's file"
         )
 
 

@@ -163,7 +163,7 @@ class WeldTactileParams(Following):
     clearance: ClassVar[float] = 15e-3
 
     finger: FingerPath = param("srm")
-    """One of data/fingers, or a .yaml file of one's own."""
+    """One of data/fingers, or a .yaml file of your own."""
     sensor: Annotated[BoundPart, Choose("sensor")]
     """Source of the finger's images, for example {opencv: {device: 0}}."""
     profiler: Annotated[BoundPart, Choose("profiler")] | None = None

@@ -90,7 +90,7 @@ ROW = "a.pcd,1,2,3,0,1,0,0"
     [
         ("second_x_m,second_y_m,second_z_m", "1,2,3",
          "poses.csv:1: the second arm's columns second_x_mm, second_y_mm, second_z_mm are missing; "
-         "they have the first's unit"),
+         "both arms have one unit"),
         ("second_x_mm,second_y_mm,second_z_mm", "1,2,3",
          "poses.csv:2: poses.0.second: needs a quaternion or a rotation vector, one of the two"),
         ("second_id", "7",

@@ -387,8 +387,8 @@ def test_a_bag_of_a_simulated_session_gives_the_same_matrix(bag: Callable[..., A
 @pytest.mark.parametrize(
     ("topics", "params", "message"),
     [
-        ("tf", {}, "holds neither clouds nor images; name the target where somebody has measured it "
-         "(a PoseStamped topic, or a frame of tf)"),
+        ("tf", {}, "holds neither clouds nor images; name the recorded poses of the "
+         "target (a PoseStamped topic, or a frame of tf)"),
         ("tf two", {}, "clouds: name one of /a, /b, for example reader: {ros2_bag: {clouds: /a}}"),
         ("tf two", {"clouds": "/c"}, "clouds: no topic '/c'; of this type: /a, /b"),
         ("two", {"clouds": "/a"}, "no topic gives the flange's pose; it has neither tf nor "

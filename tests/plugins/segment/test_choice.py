@@ -86,7 +86,7 @@ def test_another_disc_is_not_taken_for_it(inner: Any, outer: Any) -> None:
 def test_two_flanges_are_one_too_many() -> None:
     said = reason(Scene().table().flange(UR5).flange(UR5, ASIDE).scan())
     assert said.startswith("2 discs look like the flange: at (")
-    assert said.endswith(") mm; hide one or narrow near and far")
+    assert said.endswith(") mm; hide all but one, or narrow near and far")
 
 
 def test_the_wrist_of_a_wrist_circle_carries_a_plate() -> None:

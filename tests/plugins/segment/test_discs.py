@@ -225,8 +225,8 @@ def test_the_disc_that_is_seen_clearly_best_is_the_flange(discs: Any, chosen: fl
     [
         ([], "no flat surface in sight"),
         ([scored(0.9), scored(0.6, 0.2)],
-         "2 discs look like the flange: at (0, 0, 600) mm and (200, 0, 600) mm; hide one or narrow "
-         "near and far"),
+         "2 discs look like the flange: at (0, 0, 600) mm and (200, 0, 600) mm; hide all but "
+         "one, or narrow near and far"),
         ([scored(0.1)], "a disc 90 mm across with a bore has no threaded holes"),
         ([scored(0.1)._replace(flaw="low", rank=1), scored(0.2)._replace(flaw="high", rank=2)],
          "high"),

@@ -133,7 +133,7 @@ def test_two_of_them_are_told_apart_by_nobody() -> None:
     found = segment(of(np.concatenate([near, near + [0.0, 0.15, 0.0]])))
     assert isinstance(found, Rejected)
     told = re.fullmatch(
-        r"2 spheres 38.1 mm across: at \((.*)\) mm and \((.*)\) mm; hide one or narrow near and far",
+        r"2 spheres 38.1 mm across: at \((.*)\) mm and \((.*)\) mm; hide all but one, or narrow near and far",
         found.reason,
     )
     assert told

@@ -71,7 +71,7 @@ PRESSED = {"deflection": "2 mm", "preload": "1 mm"}
         ({"preload": "6.1 mm"}, {}, "a deflection of 6.1 mm exceeds the limit of finger bench"),
         (PRESSED, {"calibration": STIFF, "largest_force": "5.1 N"}, None),
         (PRESSED, {"calibration": STIFF, "largest_force": "4.9 N"},
-         "press with 5 N, limit 4.9 N; lower them, or raise 'largest_force'"),
+         "press with 5 N, limit 4.9 N; lower them, or raise 'largest_force' in the finger's file"),
     ],
 )  # fmt: skip
 def test_a_finger_is_displaced_and_pressed_no_further_than_it_stands(

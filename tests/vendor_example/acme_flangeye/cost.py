@@ -1,4 +1,4 @@
-"""A cost of one's own: what solve.iterative minimises, as cost: acme_largest_axis."""
+"""A cost of your own: what solve.iterative minimises, as cost: acme_largest_axis."""
 
 import numpy as np
 

@@ -346,7 +346,7 @@ def test_scans_decide_what_numbers_of_a_rotation_mean(folder: Path, order: str) 
     named = order.startswith("quaternion")
     turns = whole.as_quat()[:, [3, 0, 1, 2]] if named else whole.as_euler(order, degrees=True)
     np.savetxt(folder / "pendant.txt", np.hstack([1e3 * poses[:, :3, 3], turns]), fmt="%.9g")
-    assert f"of pendant.txt: {order} (arm and target turn alike to 0." in init()
+    assert f"of pendant.txt: {order} (rotations of arm and target agree to 0." in init()
     np.testing.assert_allclose(read_poses(folder), poses, atol=1e-6)
 
 

@@ -64,8 +64,18 @@ def write_ply(path: Path, source: Path) -> None:
 @pytest.mark.parametrize(
     ("heading", "angles", "scan", "guessed"),
     [
-        ("x,y,z,rx,ry,rz", vectors, "scan_{number:02d}.ply", "vector (arm and target turn alike"),
-        ("x,y,z,rx,ry,rz", fixed, "scan_{number:02d}.ply", "xyz (arm and target turn alike"),
+        (
+            "x,y,z,rx,ry,rz",
+            vectors,
+            "scan_{number:02d}.ply",
+            "vector (rotations of arm and target agree",
+        ),
+        (
+            "x,y,z,rx,ry,rz",
+            fixed,
+            "scan_{number:02d}.ply",
+            "xyz (rotations of arm and target agree",
+        ),
         ("X;Y;Z;A;B;C", kuka, "scans/part_{number}.ply", "kuka (--rotation changes it)"),
         ("name,x,y,z,a,b,c", kuka, "frame_{number}.ply", "no number in common"),
     ],

@@ -29,7 +29,7 @@ CELL = "steps: [acquire.simulated_cell, solve.robust]\n"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder of one's own models."""
+    """A folder of your own models."""
     for kind, name in (("robots", "ur5"), ("robots", "ur10e"), ("scanners", "phoxi-m")):
         shutil.copy(bundled("data") / kind / f"{name}.yaml", tmp_path)
     shutil.copy(bundled("data") / "standards" / "own-plate.yaml", tmp_path / "plate.yaml")

@@ -56,7 +56,7 @@ QUALITY_SPREAD = 1.8
 
 
 def arm_effects(problem: Problem, arm: str) -> list[Effect]:
-    """Return the effects of one arm or rail; their sizes share one quality."""
+    """Return the effects of one arm or rail; the arm's quality scales all their sizes."""
     carriers = [c for c in problem.carriers if c.arm == arm]
     accuracy = carriers[0].accuracy or ACCURACY
     effects = []

@@ -141,7 +141,7 @@ def read_cloud(
 
 
 def marked(path: Path, xyz: Points, told: Callable[[str], None] | None) -> Points:
-    """Return the points of a file, NaN where they are missing, and tell how many are."""
+    """Return the points of a file with missing ones as NaN; report their number to ``told``."""
     xyz = xyz if xyz.flags.writeable else xyz.copy()
     if (missing := mark_missing(xyz)) and told:
         told(f"{path.name}: {missing}")

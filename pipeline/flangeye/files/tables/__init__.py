@@ -78,7 +78,7 @@ def program_rows(file: Path, text: str) -> Rows | None:
 
 
 def files_at(folder: Path, name: str) -> list[Path]:
-    """Return the file of a name, or those of a pattern such as ``*/pose.json``, in natural order.
+    """Return the files that match a name or a pattern such as ``*/pose.json``, in natural order.
 
     Raises:
         StageError: No file can have such a name, or the pattern would look through all folders.
@@ -113,7 +113,7 @@ def read_table(folder: Path, name: str | Sequence[str]) -> Table:
 
 
 def tables_in(folder: Path, name: str) -> list[Table]:
-    """Return every table of a file, under the name that :func:`read_table` takes for it.
+    """Return every table of a file, each named as :func:`read_table` expects it.
 
     Raises:
         StageError: It cannot be read.
@@ -288,7 +288,7 @@ def _counted(table: Table) -> tuple[str, ...]:
 
 
 def labelled_rows(file: Path, text: str, fewest: int = MIN_CAPTURES) -> Rows | None:
-    """Return the numbers behind labels, a new row each time the labels repeat; None if too few.
+    """Return labelled numbers as rows, a new row each time the labels repeat; None if too few.
 
     Examples are ``robot: x=0.1 y=0.2 …`` and ``[INFO] [17.2]: marker pose: [0.3, …]``. Several
     numbers behind a label form a list. A label that is followed by other labels is put before their

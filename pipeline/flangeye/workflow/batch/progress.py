@@ -111,7 +111,7 @@ class Tally:
         return {name: v[~np.isnan(v)] for name, v in zip(FIGURES, whole, strict=True)}
 
     def shown(self) -> list[Row]:
-        """Return all rows if few; otherwise those without a calibration, then the worst."""
+        """Return all rows if few; otherwise first those without a calibration, then the worst."""
         return [] if self._worst is None else list(self._worst.to_pylist())
 
     def by(self) -> list[str]:

@@ -206,7 +206,7 @@ def _set_aside(log: RunLog) -> Iterator[Finding]:
         worst = sorted(gone, key=lambda o: -o["residual"])
         # Samples that are written out
         told = ", ".join(f"'{o['id']}' {1e3 * o['residual']:.1f} mm" for o in worst[:8])
-        what = f"the run's solver did not use {len(gone)} of the samples: {told} off"
+        what = f"the run's solver did not use {len(gone)} of the samples, with residuals {told}"
         # The solver's own reason for the worst names what to look for in all of them
         fix = f"look at these samples; {worst[0]['reason']}"
         yield Finding("set aside", what, fix, tuple(o["id"] for o in worst), note=True)

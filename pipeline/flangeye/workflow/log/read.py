@@ -241,7 +241,7 @@ class RunLog:
         return self.last(t.HandEye)
 
     def given(self, stage: str) -> Any:
-        """Return the last value that ``stage`` gave, None when the run did not come so far."""
+        """Return the last output of ``stage``; None if the run ended before it."""
         return next((e.value for e in reversed(self.entries) if e.stage == stage), None)
 
     def last(self, kind: type[Value]) -> Value | None:

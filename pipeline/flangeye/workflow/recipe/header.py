@@ -111,7 +111,7 @@ class RobotSection(NamedSection):
     """With urdf: the link that is the controller's base; found if not given."""
     flange: str | None = None
     """Designation of the plate, such as ISO 9409-1-50-4-M6. With urdf: the link at the plate's
-    face, z outwards, found if not given; the plate is feature's standard."""
+    face, z outwards, found if not given; feature then names the plate."""
     packages: dict[str, str] = Field(default_factory=dict)
     """With urdf: folders of the packages its meshes are in."""
     factory: str | None = None

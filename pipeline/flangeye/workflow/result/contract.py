@@ -194,7 +194,7 @@ class SeamTruthResult(_ResultPart):
     """Distance of the planned points from the true seam [m]."""
     max: float
     inside: float
-    """Share of the planned points whose tube holds it."""
+    """Share of the planned points at which the true seam is inside the tube."""
 
 
 class SeamResult(_ResultPart):
@@ -279,7 +279,7 @@ class AnswerResult(_ResultPart):
     correction: CorrectionResult | None = None
     """The arm correction that these poses require."""
     arms: dict[str, CorrectionResult] = Field(default_factory=dict)
-    """The same for each arm of a cell, by name."""
+    """The correction of each arm of a cell, by the arm's name."""
     expected_rms: float | None = None
     """Error to expect at the work, rms [m]."""
     holdout_rms: float | None = None
@@ -301,7 +301,7 @@ class StageTiming(_ResultPart):
     seconds: float
     calls: int
     idle: float | None = None
-    """Share of a live session in which the arm stood while nothing was exposed."""
+    """Share of a live session in which the arm stood still and no scan was exposed."""
 
 
 class WarningResult(_ResultPart):
@@ -362,7 +362,7 @@ class Result(_ResultPart):
     seam: SeamResult | None = None
     weld: WeldResult | None = None
     simulated: bool = False
-    """The captures are a simulator's: nothing real has been calibrated."""
+    """The captures are simulated: no real cell has been calibrated."""
     warnings: list[WarningResult] = Field(default_factory=list)
     """Action to take, and the line that does it."""
     notes: list[str] = Field(default_factory=list)

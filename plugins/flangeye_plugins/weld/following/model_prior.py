@@ -27,7 +27,7 @@ class ModelPrior:
         axial: Stiffness along the finger [N/m].
         half_angle: Angle of the joint's walls from their bisector [rad]; None if unknown.
         noise: Standard deviations of one measurement across and up [m].
-        torch_sigma: Standard deviation of the torch across the tool, relative to the tip [m].
+        torch_sigma: Standard deviation of the torch's position across the tool, from the tip [m].
         along_sigma: Standard deviation of the distance from the torch to the tip [m].
         tip_sigma: Standard deviation of the tip in the flange, along each axis [m].
         two_walls: Whether the joint has a second wall that holds the tip.

@@ -141,9 +141,9 @@ def require_secured(url: str, security: str | None) -> None:
     host = urlsplit(url).hostname or ""
     if security is None and not is_this_machine(host):
         raise StageError(
-            f"{url}: is on another machine, where anybody between can change the state: give "
+            f"{url}: is on another machine, and the connection is not protected: give "
             "--opcua-security POLICY,MODE,CERTIFICATE,KEY, such as Basic256Sha256,SignAndEncrypt,"
-            f"cert.der,key.pem, or 'none' in a network of its own"
+            f"cert.der,key.pem, or 'none' in a separate network"
         )
 
 

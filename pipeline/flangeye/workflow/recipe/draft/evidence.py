@@ -257,11 +257,11 @@ def writing_of(
         found = _by_places(((a, b), poses[id(a)], seen[id(b)]) for _, a, b in alike)
         return found and Choice(*found[0], found[1])
     beyond = f", the next {np.degrees(tried[1][0]):.1f} deg" if len(tried) > 1 else ""
-    return Choice(a, b, f"arm and target turn alike to {np.degrees(best):.2g} deg{beyond}")
+    return Choice(a, b, f"rotations of arm and target agree to {np.degrees(best):.2g} deg{beyond}")
 
 
 def rotation_of(poses: Mapping[str, Floats], seen: Floats) -> tuple[str, str] | None:
-    """Return the rotation convention in which arm and target turn alike, with its evidence.
+    """Return the rotation convention in which arm and target rotations agree, with its evidence.
 
     Args:
         poses: (N, 4, 4) poses of the flange, by the convention in which they were read.
@@ -284,7 +284,7 @@ def rotation_of(poses: Mapping[str, Floats], seen: Floats) -> tuple[str, str] | 
     if len(alike) > 1:
         return _by_places((name, poses[name], seen) for name in alike) if whole else None
     beyond = f", the next {np.degrees(tried[1][0]):.1f} deg" if len(tried) > 1 else ""
-    return name, f"arm and target turn alike to {np.degrees(best):.2g} deg{beyond}"
+    return name, f"rotations of arm and target agree to {np.degrees(best):.2g} deg{beyond}"
 
 
 def _by_places(alike: Iterable[tuple[Key, Floats, Floats]]) -> tuple[Key, str] | None:
