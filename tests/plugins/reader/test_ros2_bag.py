@@ -468,7 +468,7 @@ def test_a_topic_that_lost_its_messages_is_none(tmp_path: Path) -> None:
     with pytest.raises(StageError) as refused:
         ros2_bag(file, BagParams())
     assert str(refused.value).startswith(
-        f"{file}: holds neither clouds nor images; name the target"
+        f"{file}: holds neither clouds nor images; name the recorded poses"
     )
 
 

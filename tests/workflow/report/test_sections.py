@@ -28,7 +28,7 @@ from flangeye.workflow.report.summary import (
     tiles_of,
     transform_text,
 )
-from flangeye.workflow.report.units import degrees, duration, millimetres
+from flangeye.workflow.report.units import degrees, duration, figure, figure_name, millimetres
 from flangeye.workflow.result.contract import StageTiming
 
 Make = Callable[..., RunLog]
@@ -272,9 +272,9 @@ def test_no_text_from_the_data_becomes_markup(make_run: Make) -> None:
     assert evil not in page
     assert "<script>alert" not in page
     figures = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.S)
-    for figure in figures:
-        assert "<" not in figure
-        for text in _texts(json.loads(figure)):
+    for drawn in figures:
+        assert "<" not in drawn
+        for text in _texts(json.loads(drawn)):
             assert "<img" not in text  # plotly reads markup in its texts
     assert "&lt;img" in page
 
@@ -299,3 +299,22 @@ def test_numbers_for_people() -> None:
     assert degrees(np.pi / 180) == "1.0000"
     shown = [duration(x) for x in (0.0, 0.0000123, 0.0312, 1.2, 119.0, 180.0)]
     assert shown == ["0 ms", "0.0123 ms", "31.2 ms", "1.20 s", "119.00 s", "3.0 min"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shown"),
+    [
+        ("p95", 0.000245721, "95 % below 0.246 mm"),
+        ("corrected_p95", 0.0, "corrected 95 % below 0.000 mm"),
+        ("rms_all", 3e-4, "rms with outliers 0.300 mm"),
+        ("slide", -2e-4, "slide -0.200 mm"),
+        ("camera_x", 2e-4, "camera x 0.200 mm"),
+        ("clocking", 0.01, "clocking 0.5730 \N{DEGREE SIGN}"),
+        ("overlap", 0.93, "overlap 93%"),
+        ("scale", -12e-6, "scale -12 ppm"),
+        ("folds", 5.0, "folds 5"),
+        ("acme_index", 0.25, "acme index 0.25"),
+    ],
+)
+def test_a_check_s_figures_have_words_and_units(name: str, value: float, shown: str) -> None:
+    assert f"{figure_name(name)} {figure(name, value)}".replace("\N{NO-BREAK SPACE}", " ") == shown

@@ -39,7 +39,7 @@ from flangeye.workflow.report.summary import (
     tiles_of,
     transform_text,
 )
-from flangeye.workflow.report.units import degrees, figure, millimetres, percent
+from flangeye.workflow.report.units import degrees, figure, figure_name, millimetres, percent
 from flangeye.workflow.report.weld import seam_view, weld_drawing
 
 
@@ -67,7 +67,7 @@ def render(log: RunLog, library: str | None = None) -> str:
     content |= {"library": library, "plotly_js": "" if library else packed_plotly()}
     environment = templates(Path(__file__).parent)
     environment.filters |= {"mm": millimetres, "deg": degrees, "percent": percent}
-    environment.filters |= {"figure": figure, "words": lambda name: name.replace("_", " ")}
+    environment.filters |= {"figure": figure, "words": figure_name}
     return environment.get_template("report.html.j2").render(content)
 
 

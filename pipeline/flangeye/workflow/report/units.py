@@ -31,23 +31,33 @@ def duration(seconds: float) -> str:
     return f"{seconds * 1e3:.3g} ms" if seconds >= 1e-6 else "0 ms"
 
 
+def figure_name(name: str) -> str:
+    """Return the name of a verification's figure in words, such as ``95 % below``."""
+    words = {"p95": "95 % below", "max": "largest", "inliers": "without outliers"}
+    words |= {"all": "with outliers", "explained": "within the expected error"}
+    return " ".join(words.get(each, each) for each in name.split("_"))
+
+
 def figure(name: str, value: float) -> str:
     """Return a verification's figure with its unit, which follows from its name.
 
-    Figures are in SI; counts are whole numbers, and figures with unknown names stay as they are.
+    Figures are in SI; those with unknown names stay as they are.
     """
-    words = name.split("_")
-    if float(value).is_integer():
-        return f"{value:.0f}"
-    if any(word in ("tilt", "angle", "rotation", "turn") for word in words):
+    angles = {"tilt", "angle", "rotation", "turn", "roll", "pitch", "yaw", "clocking"}
+    lengths = {
+        "rms", "median", "mean", "p95", "max", "worst", "distance", "offset", "sigma", "shift",
+        "error", "limit", "spread", "slide", "translation", "x", "y", "z",
+    }  # fmt: skip
+    words = set(name.split("_"))
+    if words & angles:
         return f"{degrees(value)}\N{NO-BREAK SPACE}\N{DEGREE SIGN}"
-    lengths = (
-        "rms", "median", "p95", "max", "worst", "distance", "offset", "sigma", "shift", "error",
-        "limit",
-    )  # fmt: skip
-    if any(word in lengths for word in words):
+    if words & lengths:
         return f"{millimetres(value)}\N{NO-BREAK SPACE}mm"
-    return f"{value:.4g}"
+    if words & {"overlap", "explained", "share"}:
+        return percent(value)
+    if name == "scale":
+        return f"{value * 1e6:+.0f}\N{NO-BREAK SPACE}ppm"
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
 
 
 def percent(share: float) -> str:

@@ -24,7 +24,7 @@ from flangeye.workflow.report.plot import (
     scatter3d,
     thinned,
 )
-from flangeye.workflow.report.units import millimetres
+from flangeye.workflow.report.units import figure_name, millimetres
 
 BANDS = {
     "seeking": SERIES["held_out"], "bridging": SERIES["unused"], "ending": SERIES["used"],
@@ -310,7 +310,7 @@ def _facts(seam: t.Seam, facts: Facts) -> list[tuple[str, str]]:
 
 
 def _figure(name: str, value: float) -> tuple[str, str]:
-    """Return a figure in words, and its value with its unit; another step's by its own name."""
+    """Return a figure in words, and its value with its unit; a plugin's own figure is in SI."""
     words, unit = {
         "seen": ("Visible share of the part's broadest side", "%"),
         "refuted": ("Share of the part that the scanner sees through", "%"),
@@ -324,6 +324,6 @@ def _figure(name: str, value: float) -> tuple[str, str]:
         "apart": ("Distance between neighbouring clouds", "mm"),
         "points": ("Points on the surface", ""),
         "edges": ("Points on its edges", ""),
-    }.get(name, (name, ""))
+    }.get(name, (f"{figure_name(name)} (SI units)", ""))
     told = {"mm": f"{millimetres(value)} mm", "%": f"{value:.0%}"}
     return words, told.get(unit, f"{value:.4g}")
