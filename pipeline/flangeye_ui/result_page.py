@@ -324,7 +324,7 @@ def _in_3d(project: Project, box: ui.expansion, facts: Facts) -> None:
     box.clear()
     with box:
         if pose is None:
-            ui.label("There is no scanner that stands in the base to draw.")
+            ui.label("Nothing to draw: no scanner is mounted at the base.")
             return
         places = [each.tcp_in_base for each in facts.measured if each.tcp_in_base]
         scene = Scene3D(420)

@@ -31,7 +31,7 @@ class WorkRadiusParams(TranslationParams):
     """Parameters of ``cost.work_radius``."""
 
     radius: Length = param("300 mm", ge=0)
-    """Radius of the work about that point."""
+    """Radius of the work about the point 'at'."""
 
 
 @part("cost.translation")

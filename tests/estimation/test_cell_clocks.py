@@ -120,7 +120,7 @@ def test_arms_that_stood_still_have_no_clock() -> None:
 
 def test_a_camera_whose_sightings_all_disagree_is_named() -> None:
     told = (
-        r"fit one calibration to \S+ mm and \S+ deg only, worst those of marker by right; .*"
+        r"fit one calibration to \S+ mm and \S+ deg only, worst where right saw marker; .*"
         r"\(join: clock_offset, if right has another clock\)"
     )
     with pytest.raises(CalibrationRefused, match=told):

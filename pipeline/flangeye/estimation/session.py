@@ -206,7 +206,7 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
     camera, target = problem.ends[int(np.argmax(sizes))]
     raise CalibrationRefused(
         f"the sightings fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
-        f"deg only, worst those of {target} by {camera}",
+        f"deg only, worst where {camera} saw {target}",
         "check that each sighting belongs to the poses in its row (join: clock_offset, if "
         f"{camera} has another clock), and that the cell is set up as the recipe states",
     )

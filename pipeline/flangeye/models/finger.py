@@ -48,9 +48,9 @@ class Calibration(Model):
     """Result of ``flangeye tactile calibrate``."""
 
     rest: tuple[Length, Length, Length]
-    """The tag in the camera, undeformed."""
+    """Position of the tag in the camera with the finger undeformed."""
     rotation: tuple[Angle, Angle, Angle]
-    """Its rotation vector there."""
+    """Rotation vector of the tag in the camera with the finger undeformed."""
     gain: tuple[Row, Row, Row]
     """Displacement of the tip, in the tool's axes, per displacement of the tag."""
     noise: tuple[Length, Length, Length]

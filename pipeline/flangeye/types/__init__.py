@@ -243,9 +243,9 @@ class Progress:
 
     Attributes:
         poses: Number of poses so far.
-        error: No point of the workspace is off by more, with 95 % probability [m]; None while
-            no answer can be trusted.
-        required: When it stops [m].
+        error: 95 % bound of the error at any point of the workspace [m]; None while there is
+            no reliable estimate.
+        required: Error at which the solver stops [m].
     """
 
     poses: int

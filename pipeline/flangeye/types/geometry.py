@@ -186,7 +186,7 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> Floats:
 
 
 def each_applied(transforms: Floats, points: Floats) -> Floats:
-    """Return (..., 3) points, each mapped by its own of (..., 4, 4) transforms."""
+    """Return (..., 3) points, each mapped by the (4, 4) transform of the same index."""
     turned = (transforms[..., :3, :3] @ points[..., None])[..., 0]
     return np.asarray(turned + transforms[..., :3, 3])
 

@@ -48,8 +48,8 @@ class ArmsParams(Params):
     """Common parameters of simulated arms."""
 
     arm: ArmErrors = Field(default_factory=ArmErrors)
-    """How far the arms are from what their controllers report; by default by the noise of the pose
-    alone."""
+    """Errors of the arms against their controllers' models; by default only the noise of a reported
+    pose."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class CellSessionParams(ArmsParams):
     target; or always the camera, the target and the joints that are most informative for the whole
     cell, given the sightings so far."""
     spread: Angle = param("30 deg", gt=0)
-    """Largest change of a joint from there."""
+    """Largest change of a joint from home."""
     joints: bool = True
     """Whether the arms report their joint angles; a camera on a link needs them."""
 

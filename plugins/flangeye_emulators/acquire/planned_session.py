@@ -42,13 +42,13 @@ class SessionParams(ArmsParams):
     poses: int = Field(20, ge=3, le=100_000)
     """Number of captures."""
     spread: Angle = param("17 deg", gt=0)
-    """Largest change of a joint from there."""
+    """Largest change of a joint from the middle of the poses."""
     camera: PlaceParams | None = None
     """True pose of the camera in the frame that carries it; by default, such that it sees the
     target at the first pose."""
     place: PlaceParams = Field(default_factory=PlaceParams)
-    """The target's true place in what carries it, where the recipe does not know it; with camera it
-    follows from the first pose."""
+    """True pose of the target in the frame that carries it, where the recipe does not know it; if
+    camera is given, it follows from the first pose."""
     motion: Literal["together", "in_turns", "four_axes"] = "together"
     """together: two arms move at once; in_turns: only one of them moves at a time, and the other
     rests at its first pose; four_axes: the first arm is a SCARA, whose flange turns about the

@@ -200,10 +200,10 @@ class Stoppable(Protocol):
     """Interface: a controller that can stop by itself."""
 
     def protective_stop(self, why: str) -> None:
-        """Make a protective stop for a reason."""
+        """Make a protective stop; the message states ``why``."""
 
     def emergency_stop(self, why: str) -> None:
-        """Make an emergency stop for a reason; the power goes off."""
+        """Make an emergency stop, which switches the power off; the message states ``why``."""
 
 
 class FaultInjector:

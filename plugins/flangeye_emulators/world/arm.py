@@ -31,9 +31,9 @@ class ArmErrors(Params):
     """Errors of the simulated arm against its controller's model."""
 
     quality: Literal["exact", "kind", "real"] = "kind"
-    """kind: joint zeros as small as the robot's joint_accuracy, nothing else; exact: no errors, and
-    poses that repeat; real: as published recordings show arms to be. The size below replaces its
-    own."""
+    """kind: errors of the joint zeros only, of the robot's joint_accuracy; exact: no errors, and
+    poses that repeat exactly; real: errors as in published recordings. zeros replaces the
+    preset's value."""
     zeros: Angle | None = param(None, ge=0)
     """Standard deviation of the joints' zeros; real: 1 mrad."""
 

@@ -99,7 +99,7 @@ class CorrectedParams(Params):
     shift_from: str | None = None
     """Id of the first scan that is shifted."""
     backwards: bool = False
-    """The poses stand in the opposite order of the scans."""
+    """Whether the poses are in the opposite order of the scans."""
     delay: Duration = param("0 ms")
     """Time from a pose to its scan."""
 

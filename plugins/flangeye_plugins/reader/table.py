@@ -61,7 +61,7 @@ class OtherParams(ColumnsParams):
     """A table of its own, or tables side by side; joined by time, by the numbers in the names of
     files, or row by row."""
     columns: tuple[Column, ...] = ()
-    """As for the arm; required when the target is in the same table."""
+    """Names of the columns, or numbers from 1; required when the target is in the same table."""
 
     @model_validator(mode="after")
     def _found_somewhere(self) -> OtherParams:

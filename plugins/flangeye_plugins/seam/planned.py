@@ -22,8 +22,9 @@ class SeamParams(Params):
     """Common parameters of the seam stages."""
 
     arm: Literal["as-reported", "corrected"] = "as-reported"
-    """as-reported: with the pose that is best for the arm as its controller has it; corrected: with
-    that of the corrected arm, each point moved to the command that brings the tool to the seam."""
+    """Which answer locates the seam. as-reported: for the arm as its controller reports it;
+    corrected: for the corrected arm, with each point moved to the command that brings the tool to
+    the seam."""
     tool: Length = param("0 mm", ge=0)
     """corrected: from the flange to the tool's tip, along its z."""
 

@@ -30,7 +30,7 @@ class PassParams(Params):
     up: Length = param("3 mm", gt=0, le=0.05)
     """Height above the root pass, of the finger too; it must clear the bead."""
     weave_width: Length = param("0 mm", ge=0, le=0.03)
-    """As in the root pass."""
+    """Width of this pass's weave across the seam, from side to side."""
 
 
 class Following(Params):
@@ -102,9 +102,9 @@ class Following(Params):
     root_gap: Length = param("0 mm", ge=0)
     """Gap between the plates of a butt joint with square edges, on which the tip rests."""
     work_angle: Angle = param("0 deg", ge=-np.pi / 3, le=np.pi / 3)
-    """The tool's upper end leans away from the pressed wall by this."""
+    """Angle by which the tool's upper end leans away from the pressed wall."""
     travel_angle: Angle = param("0 deg", ge=-np.pi / 6, le=np.pi / 6)
-    """The tool's upper end leans forwards along the seam by this."""
+    """Angle by which the tool's upper end leans forwards along the seam."""
     offset_across: Length = param("0 mm", ge=-0.02, le=0.02)
     """Offset of the torch to the left of the seam."""
     ends: Length | None = param(None, ge=0, le=0.03)

@@ -172,7 +172,7 @@ class Expected(Model):
     closure: Length | None = None
     """Median held-out error."""
     tolerance: Length | None = None
-    """Tolerance of the closure."""
+    """Largest accepted difference of the held-out error from ``closure``."""
     findings: tuple[str, ...] | None = None
     """Names of what flangeye doctor finds, in any order. Default: not compared."""
 

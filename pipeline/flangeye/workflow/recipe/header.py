@@ -202,8 +202,8 @@ class TargetSection(NamedSection):
     unit: LengthUnit | None = None
     """Unit of the mesh's coordinates; found from its size if not given."""
     at: Literal["flange", "base", "unknown"] = "flange"
-    """The frame the mesh is drawn in; unknown: fixed to the arm's flange, drawn in a frame of its
-    own, and its place is found."""
+    """Frame in which the mesh is drawn; unknown: the body is fixed to the arm's flange, and its
+    pose on the flange is estimated."""
 
 
 Place = Literal["known", "unknown"] | PlaceParams
@@ -231,7 +231,7 @@ class MountedSection(RecipeSection):
     on: str = "base"
     """Frame that it is mounted on: base, or an arm, rail or positioner of the cell by name."""
     place: Place = "known"
-    """Its pose in that frame: known (at its origin), unknown (to be found), or position and rpy."""
+    """Pose in that frame: known (at its origin), unknown (to be estimated), or position and rpy."""
 
 
 class CellArmSection(SecondRobotSection, MountedSection):
@@ -242,7 +242,7 @@ class AxisSection(MountedSection):
     """Common section of rails and positioners."""
 
     axis: tuple[float, float, float]
-    """Its direction in its base."""
+    """Direction of the axis in the frame that it is mounted on."""
 
     @field_validator("axis")
     @classmethod

@@ -49,7 +49,7 @@ def sha256(text: str) -> str:
 
 @cache
 def library_versions() -> Mapping[str, str]:
-    """Return the versions of everything that computes, read once: 5 ms to find and to parse."""
+    """Return the versions of flangeye, Python and the numerical libraries; read once."""
     names = ("numpy", "scipy", "open3d-cpu", "open3d", "opencv-python-headless", "pydantic", "mcap")
     found = {"flangeye": VERSION, "python": platform.python_version()}
     for name in names:

@@ -184,7 +184,8 @@ class TruthResult(_ResultPart):
     """For an arm with errors: rms distance, at poses not used, between the target's position by the
     camera and by the controller [m]. The correction of the circle's place is applied, if any."""
     at_work_corrected: float | None = None
-    """The same for the corrected arm and its pose of the camera [m]."""
+    """The rms distance ``at_work`` for the corrected arm, with the camera's pose for that arm
+    [m]."""
 
 
 class SeamTruthResult(_ResultPart):
