@@ -103,8 +103,8 @@ def test_a_certificate_is_of_one_camera(run: Any) -> None:
         ),
         (
             ["--to", "ros2_command", "--set", "child=eye"],
-            "error: child: of one camera, and the cell's frames have names of their own; leave it "
-            "out, or choose one with --camera\n",
+            "error: child: names the frames of one camera, but the run has several; leave it out, or "
+            "choose one with --camera\n",
         ),
     ],
 )

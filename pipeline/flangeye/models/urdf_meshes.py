@@ -24,7 +24,7 @@ class MissingMesh(RecipeError):
 
 
 def capsule_of(body: ET.Element, urdf: Path, packages: Mapping[str, Path]) -> Capsule:
-    """Return the capsule round a geometry's body, in its own frame, checked against it.
+    """Return the capsule that encloses a collision geometry, in the geometry's frame.
 
     Args:
         body: The element within ``<geometry>``.

@@ -131,7 +131,7 @@ class VariantUnknowns(NamedTuple):
 
 
 def start_of(equations: Equations) -> VariantUnknowns:
-    """Return a start solution of each variant: first the rotations, then what is linear."""
+    """Return an initial solution of each variant: rotations first, then positions linearly."""
     camera, base, target = (_of_poses if equations.has_rotations else _of_centres)(equations)
     two_arms = equations.bases is not None
     free = not equations.knows_place or (equations.has_rotations and not two_arms)

@@ -43,7 +43,7 @@ def outlier(session: RecordedSession) -> Findings:
         return
     name = session.ids[index]
     distance = float(null.lengths[0, index, 0])
-    what = f"'{name}' is {distance * 1e3:.1f} mm off where the others agree"
+    what = f"'{name}' is {distance * 1e3:.1f} mm off the calibration of all others"
     corrected_session = session.without(np.arange(len(session)) == index)
     yield evidence.finding("outlier", what, corrected_session, samples=(name,))
 

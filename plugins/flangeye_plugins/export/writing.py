@@ -26,7 +26,7 @@ class NamedParams(Params):
     """Name of the pose in the other program, and of the file."""
 
     def require_unnamed(self, pose: CalibratedPose) -> None:
-        """Refuse frame names that are given for one camera if there are several.
+        """Refuse a frame name of one camera if the run has several cameras.
 
         Raises:
             StageError: Some are given.
@@ -34,8 +34,8 @@ class NamedParams(Params):
         given = self.model_fields_set - {"name"}
         if pose.others and given:
             raise StageError(
-                f"{' and '.join(sorted(given))}: of one camera, and the cell's frames have names "
-                "of their own; leave it out, or choose one with --camera"
+                f"{' and '.join(sorted(given))}: names the frames of one camera, but the run has "
+                "several; leave it out, or choose one with --camera"
             )
 
 

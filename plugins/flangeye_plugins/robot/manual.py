@@ -190,7 +190,7 @@ class ManualRobot(Device):
         self._asked, self._near, self._faulted = base_T_flange, joints, None
         self._waiting, self._stopped = True, False
         self._desk.say(f"Go to   {self._convention.text(base_T_flange)}")
-        self._desk.say("then type or paste where it stands")
+        self._desk.say("then type or paste the pose that it has reached")
 
     def _listen(self, patience: float) -> None:
         """Process typed lines while a pose is being requested.

@@ -663,7 +663,7 @@ def two_poses_of_nobody(folder):
          "rec: is not a folder; name the one that holds the recordings"),
         (sample, ["--camera", "wrist"], "--camera wrist: is neither base nor flange"),
         (sample, ["--target", "cube"],
-         "--target cube: is none of flange, body, sphere, charuco, checkerboard, circles, aruco, "
+         "--target cube: is not one of flange, body, sphere, charuco, checkerboard, circles, aruco, "
          "with parameters"),
         (sample, ["--target", "charuco: {columns: 8}"],
          "--target charuco.rows: is missing\n--target charuco.square: is missing\n"),
@@ -740,7 +740,7 @@ def test_a_bad_answer_is_asked_again(folder: Path) -> None:
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     said = init(typed="ur55\nur5\nflangee\nflange\nphoxi-m\nwall\nbase\n")
     assert "ur55" in said
-    assert "wall: is none of base, flange" in said
+    assert "wall: is not one of base, flange" in said
     assert recipe(folder).header.robot.model == "ur5"
 
 

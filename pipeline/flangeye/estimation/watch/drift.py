@@ -149,7 +149,7 @@ class Information:
         return Information(self.matrix[first:last].sum(0), self.vector[first:last].sum(0))
 
     def plus(self, other: Information) -> Information:
-        """Return the sum of two informations."""
+        """Return the sum of two information matrices and vectors."""
         return Information(self.matrix + other.matrix, self.vector + other.vector)
 
     @property

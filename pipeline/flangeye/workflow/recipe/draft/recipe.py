@@ -345,7 +345,7 @@ def _target(answer: str) -> dict[str, Any]:
     target = {value: {}} if isinstance(value, str) else value
     known = ("flange", "body", "sphere", "charuco", "checkerboard", "circles", "aruco")
     if not isinstance(target, dict) or len(target) != 1 or next(iter(target)) not in known:
-        raise RecipeError(f"--target {answer}: is none of {', '.join(known)}, with parameters")
+        raise RecipeError(f"--target {answer}: is not one of {', '.join(known)}, with parameters")
     if target.get("body") == {}:
         raise RecipeError("--target body: needs its mesh, as in --target 'body: gripper.stl'")
     sphere = target.get("sphere")

@@ -29,7 +29,7 @@ def one_of(*choices: str) -> Check:
 
     def check(answer: str) -> None:
         if answer not in choices:
-            raise RecipeError(f"{answer}: is none of {', '.join(choices)}")
+            raise RecipeError(f"{answer}: is not one of {', '.join(choices)}")
 
     return check
 
