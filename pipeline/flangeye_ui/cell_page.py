@@ -135,7 +135,7 @@ class Form:
             "eye-on-base": "beside the arm", "eye-in-hand": "on the arm's flange",
             "eye-on-arm": "on another link of the arm", "two-arms": "on a second arm",
         }  # fmt: skip
-        self._choice("The scanner stands", ("configuration", "name"), stands)
+        self._choice("Scanner mounted", ("configuration", "name"), stands)
         self._agree()
 
     def _start_from(self, event: Any) -> None:
@@ -270,11 +270,11 @@ class Import:
         what = {"robot": "arm"}.get(section, section)
         with ui.expansion(f"Import {'an' if what == 'arm' else 'a'} {what}") as self._box:
             self._name = ui.input(f"Name of the {what}", value=f"my_{what}")
-            self._given = {option: box(label) for option, (label, box) in boxes.items()}
+            self._given = {option: _box(*given) for option, given in boxes.items()}
             for each in (self._name, *self._given.values()):
                 each.classes("w-full").props("dense").on_value_change(self._changed)
             self._line = command_line(project.command(*self._words()))
-            ui.button(f"Import the {what}", on_click=self._import).props("outline")
+            ui.button(f"Import the {what}", on_click=self._import).props("outline no-caps")
             self._output = ui.column().classes("w-full")
         self._box.classes("w-full").props("dense")
 
@@ -470,6 +470,13 @@ class RunningDevices:
                 ui.label(line).classes("note")
 
 
+def _box(label: str, element: Callable[[str], Any]) -> Any:
+    """Return an input element; an example in the label is shown in the empty element."""
+    name, _, example = label.partition(", such as ")
+    made = element(name)
+    return made.props(f'stack-label placeholder="such as {example}"') if example else made
+
+
 def _principles(label: str) -> ui.select:
     known = get_args(ScannerModel.model_fields["principle"].annotation)
     return ui.select(list(known), label=label)
@@ -480,13 +487,13 @@ Boxes = Mapping[str, tuple[str, Callable[[str], Any]]]
 IMPORTED: Mapping[str, Boxes] = {
     "robot": {
         "urdf": ("Its URDF file, in this folder", ui.input),
-        "joint": ("Or its joints, a line each: d: 89.159 mm, alpha: 90 deg", ui.textarea),
+        "joint": ("Or its joints, a line each, such as d: 89.159 mm, alpha: 90 deg", ui.textarea),
         "standard": ("Plate", lambda label: ui.select(_standards(), label=label)),
     },
     "scanner": {
         "near": ("Minimum working distance, such as 300 mm", ui.input),
         "far": (
-            "Maximum working distance, such as 900 mm (recordings need nothing below)",
+            "Maximum working distance, such as 900 mm; all below is optional",
             ui.input,
         ),
         "principle": ("Principle", _principles),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from flangeye_ui.project import Project
 
 WAY = {
-    "Cell": ("/", "Choose the arm, the scanner and how they stand."),
+    "Cell": ("/", "Choose the arm, the scanner and its mounting."),
     "Poses": ("/poses", "Check that the arm reaches every pose and the scanner sees it."),
     "Scan": ("/scan", "Let the scanner look at the flange from every pose."),
     "Result": ("/result", "See whether the calibration can be trusted, and what would mend it."),

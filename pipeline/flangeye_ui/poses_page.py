@@ -112,13 +112,13 @@ class PosePlanner:
         else:
             position = [f"{1e3 * v:g} mm" for v in self._simulated.position]
         place = ui.input(
-            "Where the scanner stands (x, y, z in the base)", value=", ".join(map(str, position))
+            "Scanner position (x, y, z in the base)", value=", ".join(map(str, position))
         )
         place.on("change", lambda e: self._place([x.strip() for x in e.args.split(",")]))
         place.classes("w-full")
-        ui.label("Drag the blue ball, or type: a tape measure is good enough.").classes(
-            "text-caption"
-        )
+        ui.label(
+            "Drag the blue ball, or type the position: a tape measure is accurate enough."
+        ).classes("text-caption")
         if guessed:
             self._showing((view.get("shown") or {}).get("joints") or [])
 

@@ -36,8 +36,8 @@ from flangeye_ui.served_files import address_of
 TOUCH_FIELDS = {
     "seen": ("A point in the camera, from a scan", "12 mm, -40 mm, 702 mm"),
     "tip": ("The tool's tip in the flange", "0 mm, 0 mm, 152 mm"),
-    "position": ("The flange by the pendant, the tip on the point", "412 mm, -35 mm, 180 mm"),
-    "rpy": ("Its roll, pitch, yaw", "180 deg, 0 deg, 30 deg"),
+    "position": ("Flange position on the pendant, tip on the point", "412 mm, -35 mm, 180 mm"),
+    "rpy": ("Roll, pitch, yaw of the flange", "180 deg, 0 deg, 30 deg"),
 }
 """Label and example of each parameter that a person fills in, by the step's names."""
 
@@ -307,7 +307,7 @@ def warnings_of(facts: Facts) -> list[str]:
 def _matrix(facts: Facts) -> None:
     for name, estimate in facts.result.transforms.items():
         text = transform_text(name, estimate)
-        ui.label(f"{text.name} {text.meaning}.")
+        ui.label(f"{text.name} {text.meaning}. The matrix is in metres.")
         with ui.row().classes("gap-x-6 gap-y-1"):
             ui.label(f"x, y, z: {', '.join(text.translation)} mm")
             ui.label(f"roll, pitch, yaw: {', '.join(text.rotation)}°")

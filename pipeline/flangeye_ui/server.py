@@ -73,7 +73,7 @@ def serve(folder: Path, registry: Registry, host: str, port: int, browser: bool)
         raise StageError(f"{folder}: is not a folder")
     require_free(host, port)
     at = f"http://{f'[{host}]' if ':' in host else host}:{port}/?token="
-    keys = Keys(lambda token: say(f"for another browser, once: {at}{token}"))
+    keys = Keys(lambda token: say(f"for one other browser: {at}{token}"))
     project = Project(folder.resolve(), registry, MoveCodes(say))
     for each in (
         cell_page, poses_page, scan_page, result_page, use_page, watch_page, archive_page, scene,

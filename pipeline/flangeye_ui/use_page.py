@@ -23,7 +23,7 @@ from flangeye_ui.result_page import chosen_run
 from flangeye_ui.served_files import address_of
 
 CERTIFICATE_FIELDS = {
-    "temperature": "Temperature of the air, °C", "spread": "Coldest to warmest in use, K",
+    "temperature": "Temperature of the air, °C", "spread": "Temperature range in use, K",
     "place": "Where it was done", "operator": "Who did it",
 }  # fmt: skip
 """Options of the command that a person must fill in, and their labels."""
@@ -87,7 +87,8 @@ class Systems:
     def _item(self, name: str) -> ui.item:
         with ui.item(on_click=lambda: self._choose(name)) as item, ui.item_section():
             ui.item_label(name.replace("_", " "))
-            ui.item_label(self._files[name][0].removeprefix("Write ")).props("caption")
+            what = self._files[name][0].removeprefix("Write ")
+            ui.item_label(what[:1].upper() + what[1:]).props("caption")
         return item.props(f'role="button" aria-label="{name}"')
 
     def _search(self, words: str | None) -> None:

@@ -122,7 +122,7 @@ def test_a_token_works_once_and_the_terminal_shows_the_next(hostile: Served) -> 
     first = hostile.address.partition(str(hostile.port))[2]
     assert "HttpOnly; SameSite=Strict; Path=/" in Answer(hostile, first).headers["set-cookie"]
     assert Answer(hostile, first).status == 403
-    assert hostile.last(r"^for another browser, once: (\S+)") != first
+    assert hostile.last(r"^for one other browser: (\S+)") != first
 
 
 @pytest.mark.parametrize(

@@ -232,7 +232,7 @@ def test_a_plan_with_three_shown_poses(browser: Any, served: Served) -> None:
     write_recipe(page, find_recipe("ur5e_phoxi-m_loopback").read_text())
     page.get_by_text("The recipe is valid.").wait_for()
     go(page, "Poses")
-    place = page.get_by_label("Where the scanner stands (x, y, z in the base)")
+    place = page.get_by_label("Scanner position (x, y, z in the base)")
     place.fill("600 mm, 0 mm, 950 mm")
     place.press("Tab")
     page.wait_for_load_state()
@@ -881,8 +881,8 @@ def test_a_point_is_checked_by_touch(browser: Any, served: Served, finished: Pat
     flange = base + [0.0005, 0.0, 0.15]
     for label, text in (
         ("The tool's tip in the flange", "0 mm, 0 mm, 150 mm"),
-        ("The flange by the pendant", ", ".join(f"{1e3 * x:.4f} mm" for x in flange)),
-        ("Its roll, pitch, yaw", "180 deg, 0 deg, 0 deg"),
+        ("Flange position on the pendant", ", ".join(f"{1e3 * x:.4f} mm" for x in flange)),
+        ("Roll, pitch, yaw of the flange", "180 deg, 0 deg, 0 deg"),
     ):
         page.get_by_label(label).fill(text)
         page.get_by_label(label).press("Tab")

@@ -121,7 +121,7 @@ def test_a_camera_in_hand_is_calibrated_before_a_fixed_board(terminal, moved_by)
     with peers(arm, Camera(env, "image", in_hand=True), Frames(env)) as (arm, camera, tree):
         out, _ = terminal.run("init", "--ros2", "--scanner", "phoxi-m", "--yes",
                               "--camera", "flange", "--target", PRINTED)  # fmt: skip
-        assert "roughly where the printed target stands in the base" in out
+        assert "rough position of the printed target in the base" in out
         if controller:
             terminal.run(*words, "--move", *QUICK)
         else:

@@ -105,7 +105,7 @@ def _view(
         eye, why = cell.camera[:3, 3], "the graph has it"
     questions.likely["view"] = in_mm(eye), why
     what = "printed target" if in_hand else "scanner"
-    answer = questions.ask("view", f"roughly where the {what} stands in the base", None)
+    answer = questions.ask("view", f"rough position of the {what} in the base", None)
     position = _lengths("view", answer)
     if cell.camera is not None and not in_hand and answer == in_mm(eye):
         turn = cell.camera[:3, :3]
