@@ -222,7 +222,7 @@ def exchanged(session: RecordedSession) -> Findings:
     what = (
         f"as the poses are read, the {carried_by[session.carried][0]} is {carried:.2f} m from the "
         f"flange that carries it, and the {carried_by[session.carried][1]} {standing:.2f} m from "
-        f"the base: probably {told}, which fits as well"
+        f"the base; the poses fit as well, at more usual distances, if {told}"
     )
     misfit = fit_of(session).misfit()
     # Whatever explains errors comes first

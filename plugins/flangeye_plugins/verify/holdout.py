@@ -237,10 +237,12 @@ def _misread(calibration: HandEye, cell: Cell, optical: bool) -> tuple[str, str]
     # distances of camera and target from what carries them do.
     if Reading() not in readings:
         return (
-            f"{carried.child} would be {near:.2f} m from the flange, and {standing.child} "
-            f"{far:.2f} m from the base: probably {readings[0].mistake(pairs.in_hand)}, which fits "
-            "as well",
-            "if the distances are right, state the target's place (configuration: {place: …})",
+            f"as the poses are read, {carried.child} is {near:.2f} m from the flange, and "
+            f"{standing.child} {far:.2f} m from the base; the poses fit as well, at more usual "
+            f"distances, if {readings[0].mistake(pairs.in_hand)}",
+            "measure one of the two distances: if it is right, state the target's place "
+            "(configuration: {place: …}); the origin of visual odometry may be anywhere, so its "
+            "distances decide nothing",
         )
     axes = other_axes(markers[:, :3, 3]) if optical else None
     side = {"opengl": "behind", "ros": "beside"}
