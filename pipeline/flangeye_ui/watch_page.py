@@ -62,7 +62,7 @@ class Watch:
             self._which = ui.select(stored, label="Calibration", value=stored[0])
             self._which.classes("col-12 col-md-5").on_value_change(self._choose)
             self._new = ui.select(
-                self._runs, label="New scans: run, or folder", with_input=True,
+                self._runs, label="New scans: run or folder", with_input=True,
                 new_value_mode="add-unique",
             )  # fmt: skip
             self._new.classes("col-12 col-md").on_value_change(self._ask)

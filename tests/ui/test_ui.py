@@ -234,8 +234,8 @@ def test_a_plan_with_three_shown_poses(browser: Any, served: Served) -> None:
     go(page, "Poses")
     place = page.get_by_label("Scanner position (x, y, z in the base)")
     place.fill("600 mm, 0 mm, 950 mm")
-    place.press("Tab")
-    page.wait_for_load_state()
+    with page.expect_navigation():  # the page is loaded again with the new position
+        place.press("Tab")
     page.get_by_role("heading", name="Poses").wait_for()
     assert "600 mm" in (served.folder / "cell.yaml").read_text()
     page.get_by_text("Or show three poses").click()

@@ -146,8 +146,7 @@ def test_a_check_is_a_sentence() -> None:
     )
     moved = finding(3, since=2, part="scanner", probability=0.87654)
     assert sentence(moved) == (
-        "the work is off by 1.23 mm at its worst corner, since check 2; scanner explains it best "
-        "(88%)."
+        "the work is off by 1.23 mm at its worst corner, since check 2; most likely scanner (88%)."
     )
     assert sentence(finding(3, since=0)).endswith("corner, since check 0.")
 

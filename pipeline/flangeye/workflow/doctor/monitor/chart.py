@@ -39,7 +39,7 @@ def sentence(finding: CheckFinding) -> str:
     how_far = f"the work is off by {finding.shift * 1e3:.2f} mm at its worst corner"
     if finding.since is None:
         return f"{how_far}, which is within what the calibration allows."
-    part = f"; {finding.part} explains it best ({finding.probability:.0%})" if finding.part else ""
+    part = f"; most likely {finding.part} ({finding.probability:.0%})" if finding.part else ""
     return f"{how_far}, since check {finding.since}{part}."
 
 
