@@ -98,7 +98,7 @@ class CertifiedAnswer:
         return first, second
 
     def place(self, step: PathStep, times: Indices) -> Floats:
-        """Return a known frame's pose (M, 4, 4) at each time, inverted on a path backwards."""
+        """Return a known frame's pose (M, 4, 4) at each time, or its inverse on a backward step."""
         place = np.asarray(self.frames[step.name].place)
         every = np.broadcast_to(place, (len(times), 4, 4)) if place.ndim == 2 else place[times]
         return invert(every) if step.back else every

@@ -25,7 +25,7 @@ class Recess(Model):
     """A slot milled into the face along a circle, with round ends, such as Franka's three."""
 
     angle: Angle
-    """Direction of its middle, about the flange's z."""
+    """Angle about the flange's z to the middle of the recess."""
     radius: Length = param(gt=0)
     """Radius of the circle its centre line follows."""
     half_span: Angle

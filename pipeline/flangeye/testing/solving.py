@@ -117,7 +117,7 @@ class SolvingConformance(Conformance):
         return t.Observations(observations, source, len(observations))
 
     def known(self, observations: Sequence[t.Observation], motion: Floats = HERE) -> dict[Any, Any]:
-        """Return the runner's values beside the calibration."""
+        """Return what the runner passes to the stage in addition to the calibration."""
         return {
             t.Observations: self.stream(observations),
             t.Solver: reference_solution,
@@ -166,7 +166,10 @@ class SolveConformance(SolvingConformance):
         answer = self.answer(observations)
         ids = [pair.observation.id for pair in answer.pairs]
         require(len(ids) == len(set(ids)), "an observation has several pairs")
-        require(set(ids) <= {o.id for o in observations}, "a pair is of no observation")
+        require(
+            set(ids) <= {o.id for o in observations},
+            "a pair names an observation that was not given",
+        )
         require(len(ids) >= 3, "fewer than three pairs")
         if answer.correction is None:
             pose = answer.base_T_camera.transform

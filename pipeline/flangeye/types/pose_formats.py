@@ -437,7 +437,7 @@ def pose_of_numbers(
 
 
 def by_columns(matrices: Floats) -> bool:
-    """Return whether all matrices (N, k) of 16 numbers stand column by column, and not by rows."""
+    """Return whether all matrices (N, k) of 16 numbers are stored by columns, not by rows."""
     if matrices.shape[1] != 16:
         return False
     columns, rows = matrices[:, 3::4] == [0, 0, 0, 1], matrices[:, 12:] == [0, 0, 0, 1]

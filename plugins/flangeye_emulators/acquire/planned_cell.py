@@ -34,7 +34,7 @@ class CellSessionParams(ArmsParams):
     sightings: int = Field(60, ge=3, le=100_000)
     """Number of sightings, evenly distributed over the pairs of camera and target."""
     places: dict[str, PlaceParams] = Field(default_factory=dict)
-    """Where everything that the cell leaves unknown truly is, by frame; the base of an arm called
+    """True poses of the frames that the cell leaves unknown, by frame; the base of an arm called
     two is two_base."""
     home: dict[str, tuple[Angle, ...]] = Field(default_factory=dict)
     """Joints of an arm at the middle of its poses, by its name."""

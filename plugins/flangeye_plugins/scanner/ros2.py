@@ -192,8 +192,8 @@ class Ros2Scanner(OpenScanner):
         message = self._bridge.wait(topic, 0, max(until - time.monotonic(), 0.0))
         if message is None:
             raise DeviceError(
-                f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s; camera_info "
-                "names another topic"
+                f"{NAME}: nothing came on {topic} within {self._params.timeout:g} s; name its "
+                "topic: camera_info: TOPIC"
             )
         # By ROS convention a rectified image says so in its topic, and has a matrix of its own in
         # CameraInfo

@@ -103,7 +103,10 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
 def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radius: float) -> Seam:
     """Return the plan with each corner replaced by an arc of this radius [m]."""
     if params.leg is not None:
-        raise StageError("weld.tactile: corner_radius leaves no legs; leave out one of the two")
+        raise StageError(
+            "weld.tactile: with corner_radius the seam is welded in one, without legs; leave out "
+            "'corner_radius' or 'leg'"
+        )
     points = seam.points_in_base
     along = arc_lengths(points)
     ends = [0.0, *(along[each.point] for each in corners), along[-1]]
