@@ -64,6 +64,8 @@ class RunProcess:
         self.began, self._capture = time.monotonic(), ""
         out = [] if self.checks else ["--out", stamped]
         self.words = [*words, *out, *(["--move"] if move else [])]
+        # -P: a Python file in the folder must not stand in for a library. A session of its own:
+        # Ctrl-C in the server's terminal ends the server, which then stops the run
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "flangeye.cli", *self.words],
             cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

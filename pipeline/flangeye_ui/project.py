@@ -200,6 +200,7 @@ class Project:
         else:
             kinds, kind = list(KINDS), name.partition(".")[0]
             ranks = [kinds.index(each.partition(".")[0]) for each in names]
+            # Before the first later kind; after steps of its own kind if there may be several
             before = kinds.index(kind) + KINDS[kind].several
             at = next((i for i, rank in enumerate(ranks) if rank >= before), len(steps))
             replaced = not KINDS[kind].several and kinds.index(kind) in ranks

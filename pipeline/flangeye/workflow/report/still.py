@@ -57,6 +57,7 @@ def _ready(model: str) -> tuple[float, ...]:
         # Of the flange from level, in the arm that is ready to be scanned [rad]
         found = arm.inverse(rigid(rotation_from_rpy(0.0, 0.25, 0.0), flange))
         if len(found):
+            # Elbow up: the solution whose links are highest, and none of them below the floor
             heights = [arm.frames(q)[:, 2, 3].min() + arm.frames(q)[:, 2, 3].mean() for q in found]
             return tuple(found[int(np.argmax(heights))])
     return (0.0,) * arm.n
