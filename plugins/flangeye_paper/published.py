@@ -165,7 +165,7 @@ class StoredParams(Params):
     """Parameters of ``verify.stored_results_as_in_paper``."""
 
     robot: Literal["aubo", "ur5", "franka"]
-    """Whose results."""
+    """Robot whose stored results are used."""
 
 
 @stage("verify.stored_results_as_in_paper")

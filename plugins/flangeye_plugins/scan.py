@@ -89,11 +89,11 @@ class AlongParams(Params):
     end: tuple[Length, Length, Length]
     """Where it roughly ends."""
     opening: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Out of the work, in the base: the scanner looks against it."""
+    """Direction out of the work, in the base; the scanner looks against it."""
     distance: Length = param("650 mm", gt=0)
-    """From the seam to the scanner."""
+    """Distance from the seam to the scanner."""
     step: Length = param("250 mm", gt=0)
-    """Largest way from one place to the next, along the seam."""
+    """Largest distance between neighbouring scan positions along the seam."""
 
 
 @stage("scan.along")

@@ -37,7 +37,7 @@ class LaidParams(Params):
     position: tuple[Length, Length, Length] = param(("600 mm", "0 mm", "250 mm"))
     """Position of the workpiece's CAD origin in the base."""
     rpy: tuple[Angle, Angle, Angle] = param(("0 deg", "0 deg", "20 deg"))
-    """Roll, pitch, yaw of its CAD, in base."""
+    """Roll, pitch, yaw of the workpiece's CAD frame in the base."""
 
     @property
     def base_T_part(self) -> Floats:

@@ -40,7 +40,7 @@ class LineParams(SeamParams, PlaceParams):
     angle: Angle = param("30 deg", gt=0)
     """CAD: smallest bend of a sharp edge."""
     opening: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Out of the work towards the torch, in the file's frame."""
+    """Direction out of the work towards the torch, in the file's frame."""
     deviation: Length = param("3 mm", gt=0)
     """Standard deviation of the line across it, in the base."""
 

@@ -26,7 +26,7 @@ class SeamParams(Params):
     corrected: for the corrected arm, with each point moved to the command that brings the tool to
     the seam."""
     tool: Length = param("0 mm", ge=0)
-    """corrected: from the flange to the tool's tip, along its z."""
+    """With arm: corrected, the distance from the flange to the tool's tip, along the flange's z."""
 
 
 def scanner_covariance(scanner: ScannerModel | None, distance: float) -> Floats:

@@ -46,7 +46,7 @@ class SegmentBodyParams(Params):
     far: Length = param("3 m", gt=0)
     """Points farther from the scanner are left out."""
     min_coverage: float = param(0.3, gt=0, le=1)
-    """Smallest share of the body's view to be seen."""
+    """Smallest share of the body's expected view that must be visible."""
     min_trust: float = param(0.99, gt=0, le=1)
     """Smallest share of the rays at the body and right beside it that agree with it."""
 

@@ -27,7 +27,7 @@ class TouchParams(Params):
     tip: tuple[Length, Length, Length]
     """Tool tip in the flange frame, from the tool's own calibration."""
     touches: tuple[TouchedPoint, ...] = Field(min_length=1)
-    """Use three or more at different places and heights."""
+    """Touched points: three or more, at different places and heights."""
     max_error: Length = param("1 mm", gt=0)
     """Largest distance that passes."""
 
