@@ -106,7 +106,10 @@ def test_what_the_run_set_aside_is_named_and_coarse_decimals_are_said(
     (tmp_path / "cell.yaml").write_text(RECIPE)
     assert command("run", "cell.yaml", "--out", "out")[0] == 0
     _, out, _ = command("doctor", "out/run.mcap")
-    assert "note: set aside: the run's solver did not use 1 of the samples: '0007' " in out
+    assert (
+        "note: set aside: the run's solver did not use 1 of the samples, with residuals '0007' "
+        in out
+    )
     said = "positions of the arm are whole multiples of 1 mm, and the recipe asks for 1 mm; if they"
     assert f"note: rounded: {said} were rounded, that alone is an error of 0.5 mm" in out
     assert "fix: write positions with 4 or more decimals of a metre" in out
