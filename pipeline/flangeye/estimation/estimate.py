@@ -24,6 +24,7 @@ from flangeye.estimation.mixed import (
     fit,
     left_out,
     mode_of,
+    posterior,
 )
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.types import Floats, Indices, Mask
@@ -79,12 +80,11 @@ class Estimate:
         """Return the estimate without some sightings; variance components and outliers stay."""
         inliers = self.inliers.copy()
         inliers[rows] = False
+        known = self.posterior.without(rows)
         if any(self.problem.walk):  # what the others predict of the drift is another without them
             shares = inliers.astype(float)
             model = model_at(self.problem, self.places, self.effects, shares)
-            known = Posterior(model, fit(model, self.fit.sizes))
-        else:
-            known = self.posterior.without(rows)
+            known = self.posterior.refitted(model)
         return replace(self, posterior=known, inliers=inliers)
 
     @property
@@ -227,7 +227,7 @@ def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: 
         seen.add(key)
         places = problem.moved(places, step)
         inliers = good if good.sum() >= 3 else inliers
-    return Estimate(problem, effects, places, Posterior(model, found, mode), inliers, squares)
+    return Estimate(problem, effects, places, posterior(model, mode, found), inliers, squares)
 
 
 def judged(model: LinearModel, found: Fit) -> tuple[Floats, Mask]:

@@ -17,6 +17,7 @@ linear in N. Arrays only.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -273,18 +274,6 @@ def spread_of(rows: Floats, covariance: Floats) -> Floats:
     return np.asarray(flat.reshape(rows.shape) @ np.swapaxes(rows, 1, 2))
 
 
-class Peak(NamedTuple):
-    """The most likely sizes.
-
-    Attributes:
-        z: (Z,) the sizes as standard normal values.
-        spread: (Z, Z) root of the covariance of z, from the curvature at the mode.
-    """
-
-    z: Floats
-    spread: Floats
-
-
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Joint posterior of places and effects: a mixture of Gaussians over the sizes.
@@ -292,34 +281,17 @@ class Posterior:
     Attributes:
         model: The linearised sightings.
         mode: The fit at the most likely sizes.
-        peak: The most likely sizes; None for the posterior at these sizes alone.
+        fits: One fit for each draw of the sizes.
+        chances: (F,) weights of the draws; they sum to one.
+        cost: -2 log of the restricted likelihood times the sizes' prior at the mode, up to a
+            constant.
     """
 
     model: LinearModel
     mode: Fit
-    peak: Peak | None = None
-
-    @property
-    def cost(self) -> float:
-        """-2 log of the restricted likelihood times the prior at the mode, up to a constant."""
-        z = np.zeros(0) if self.peak is None else self.peak.z
-        return self.mode.cost + float(z @ z)
-
-    @property
-    def fits(self) -> tuple[Fit, ...]:
-        """One fit for each draw of the sizes."""
-        return self._drawn[0]
-
-    @property
-    def chances(self) -> Floats:
-        """Weights (F,) of the draws; they sum to one."""
-        return self._drawn[1]
-
-    @cached_property
-    def _drawn(self) -> tuple[tuple[Fit, ...], Floats]:
-        if self.peak is None:
-            return (self.mode,), np.ones(1)
-        return _drawn(self.model, self.peak, self.mode)
+    fits: tuple[Fit, ...]
+    chances: Floats
+    cost: float
 
     @cached_property
     def mean(self) -> Floats:
@@ -334,17 +306,17 @@ class Posterior:
         return np.asarray(within + (apart.T * self.chances) @ apart)
 
     def without(self, rows: Indices) -> Posterior:
-        """Return the posterior without some sightings, at the most likely sizes with them.
-
-        It is in closed form: the cost is that of the sightings left out.
-        """
-        shares, taken, at = self.model.shares.copy(), self.model.where(rows), self.mode
+        """Return the estimate without some sightings in closed form; variance components stay."""
+        shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
-        known = whitened(taken, at.sizes)
-        information = at.information - known.rows.T @ known.rows
-        right = at.right - known.rows.T @ known.errors
-        mode = _solved(taken, at.sizes, information, right)
-        return Posterior(self.model.weighted(shares), mode)
+        mode, *fits = _without(taken, [self.mode, *self.fits])
+        left = self.model.weighted(shares)
+        return replace(self, model=left, mode=mode, fits=tuple(fits))
+
+    def refitted(self, model: LinearModel) -> Posterior:
+        """Return the estimate by another model of the sightings; variance components stay."""
+        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.fits))
+        return replace(self, model=model, mode=mode, fits=tuple(fits))
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
@@ -364,6 +336,18 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
     of_effects = np.array([np.tensordot(each, each, axes=((0, 2), (0, 2))) for each in parts])
     whole = np.tensordot(known.chances, moved, axes=1) @ rows.T
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
+
+
+class Peak(NamedTuple):
+    """The most likely sizes.
+
+    Attributes:
+        z: (Z,) the sizes as standard normal values.
+        spread: (Z, Z) root of the covariance of z, from the curvature at the mode.
+    """
+
+    z: Floats
+    spread: Floats
 
 
 def mode_of(model: LinearModel, start: Floats | None = None) -> Peak:
@@ -402,9 +386,9 @@ def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Flo
     return None
 
 
-def _drawn(model: LinearModel, peak: Peak, at_mode: Fit) -> tuple[tuple[Fit, ...], Floats]:
-    """Return fits at sizes drawn about their mode, with weights: this marginalises the sizes."""
-    (z, spread), some, prior = peak, model.subsampled(), model.sizes
+def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
+    """Return the joint posterior, with the sizes marginalised by sampling about their mode."""
+    (z, spread), some, prior = mode, model.subsampled(), model.sizes
     fits, logs = [], []
     # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
     # give or take 6 % from session to session
@@ -414,6 +398,10 @@ def _drawn(model: LinearModel, peak: Peak, at_mode: Fit) -> tuple[tuple[Fit, ...
         # Posterior exp(-(cost + z'z) / 2) over the density of the draw: the importance weight
         logs.append(0.5 * float(draw @ draw - found.cost - at @ at))
         fits.append(found)
+    chances = np.exp(np.array(logs) - max(logs))
+    # A third of the draws weigh less, and a fifth of a percent together
+    kept = np.flatnonzero(chances > 1e-3 * chances.sum())
+    fits, chances = [fits[k] for k in kept], chances[kept]
     if some is not model:
         # So many sightings determine the noise's own sizes to a few percent
         own = model.factors
@@ -421,8 +409,23 @@ def _drawn(model: LinearModel, peak: Peak, at_mode: Fit) -> tuple[tuple[Fit, ...
             sizes = each.sizes.copy()
             sizes[own] = at_mode.sizes[own]
             fits[k] = _solved(model, sizes, at_mode.information, at_mode.right)
-    chances = np.exp(np.array(logs) - max(logs))
-    return tuple(fits), chances / chances.sum()
+    cost = at_mode.cost + float(z @ z)
+    return Posterior(model, at_mode, tuple(fits), chances / chances.sum(), cost)
+
+
+def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
+    """Yield fits without some of their sightings, each at its own sizes."""
+    # The information of a sighting depends on the noise's sizes alone, which many fits share
+    amounts = np.array([each.sizes[taken.factors].prod(axis=1) for each in fits])
+    amounts, which = np.unique(amounts, axis=0, return_inverse=True)
+    noise = taken.still + np.tensordot(amounts, taken.causes, axes=1)
+    whitening = np.sqrt(taken.shares)[:, None, None] * np.linalg.inv(np.linalg.cholesky(noise))
+    rows = (whitening @ taken.design).reshape(len(amounts), -1, taken.design.shape[2])
+    errors = (whitening @ taken.residuals[..., None]).reshape(len(amounts), -1, 1)
+    across = np.swapaxes(rows, 1, 2)
+    information, right = across @ rows, (across @ errors)[..., 0]
+    for k, each in zip(which.ravel(), fits, strict=True):
+        yield _solved(taken, each.sizes, each.information - information[k], each.right - right[k])
 
 
 def _draws(count: int, samples: int) -> Floats:

@@ -89,8 +89,8 @@ def _weights(work: Problem, rotations: Floats, box: Floats) -> Floats:
     half = (box[1] - box[0]) / 2
     at = (poses[:, :3, 3] - box.mean(axis=0)) / np.where(half > 0, half, np.inf)
     inside = (np.abs(at) <= 1 + 1e-9).all(axis=1)
-    # A box without any reachable pose must still give an average
-    inside = inside if inside.any() else ~inside
+    if not inside.any():  # a box without any reachable pose must still give an average
+        return np.full(len(at), 1 / len(at))
     middle = rotations.mean(axis=0)
     turns, every = (skew_parts(each @ middle.T) for each in (poses[:, :3, :3], rotations))
     numbers = np.hstack([np.ones((len(at), 1)), at, turns])[inside]
