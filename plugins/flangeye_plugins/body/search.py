@@ -52,13 +52,11 @@ class BodyVerdict(NamedTuple):
 
     @property
     def bounded(self) -> bool:
-        """Whether the body's outline is seen, or nothing is seen around it."""
+        """Whether the body's outline is seen, or nothing is seen around it but what hides it."""
         # Smallest share of the outline that must end before something farther: otherwise a plate
         # would fit any face of a box
-        ended = 0.03
-        return (
-            self.ended >= ended * self.outline or self.beside < ended * self.outline
-        ) and self.outline > 0
+        least = 0.03 * self.outline
+        return self.outline > 0 and (self.ended >= least or self.ended + self.crossing < least)
 
     @property
     def shown(self) -> float:

@@ -37,7 +37,7 @@ from flangeye_emulators.world.mesh import MATERIALS, Mesh, box, flange_mesh, wri
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
-from flangeye_plugins.body.search import BodySearch
+from flangeye_plugins.body.search import BodySearch, BodyVerdict
 from flangeye_plugins.body.search import around as points_around
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
@@ -230,6 +230,22 @@ def test_a_body_that_is_not_there_is_refused() -> None:
     absent = found(scan(shipped("torch")))
     assert isinstance(absent, Rejected)
     assert "gripper" in absent.reason
+
+
+@pytest.mark.parametrize(
+    ("beside", "ended", "crossing", "bounded"),
+    [
+        (0, 0, 0, True),  # nothing was measured around it
+        (60, 0, 0, True),  # all that was measured there hides what is behind
+        (60, 30, 20, True),  # the body ends before something farther
+        (60, 2, 50, False),  # what is there goes on, as on the face of a box
+    ],
+)
+def test_a_body_is_bounded_unless_what_is_seen_beside_it_goes_on(
+    beside: int, ended: int, crossing: int, bounded: bool
+) -> None:
+    seen = BodyVerdict(300, 250, 0, 0, beside, ended, crossing, outline=100)
+    assert seen.bounded is bounded
 
 
 @pytest.mark.parametrize(
