@@ -345,7 +345,7 @@ class BodySearch:
             for reach in reaches:
                 poses = self.looks.settled(poses, self._coarse, count, reach * self.looks.size)
             scores = self.looks.scores(poses, self._coarse, count, tolerance)
-            poses = poses[distinct(poses, scores, self.looks)[:left]]
+            poses = poses[distinct(poses, scores, self.looks, left)]
         found = self.near(poses)
         if not found:
             return []
@@ -365,7 +365,7 @@ class BodySearch:
         kept = np.flatnonzero(agree >= least)
         if not len(kept):
             return []
-        kept = kept[distinct(poses[kept], ranks[kept], self.looks)[:8]]
+        kept = kept[distinct(poses[kept], ranks[kept], self.looks, 8)]
         best, others = self._laid(poses[kept[0]]), kept[1:]
         if best and self.passes(best):
             others = others[agree[others] >= best.rivalled_from]
@@ -451,7 +451,7 @@ class BodySearch:
     def _distinct(self, found: list[FoundPose]) -> list[FoundPose]:
         poses = np.array([one.pose for one in found]).reshape(-1, 4, 4)
         scores = np.array([one.verdict.score for one in found])
-        return [found[k] for k in distinct(poses, scores, self.looks)]
+        return [found[k] for k in distinct(poses, scores, self.looks, len(found))]
 
 
 def around(points: Singles, shape: Shape, *poses: Floats) -> Singles:
@@ -464,15 +464,15 @@ def around(points: Singles, shape: Shape, *poses: Floats) -> Singles:
     return np.asarray(points[near])
 
 
-def distinct(poses: Floats, scores: Floats, looks: Looks) -> Indices:
-    """Return the indices of poses that differ from each other, best first."""
-    order = np.argsort(-scores, kind="stable")
-    near = alike(poses[order], poses[order], looks)
-    free = np.ones(len(order), bool)
-    for k in range(len(order)):
-        if free[k]:
-            free[k + 1 :] &= ~near[k, k + 1 :]
-    return order[free]
+def distinct(poses: Floats, scores: Floats, looks: Looks, most: int) -> list[int]:
+    """Return the indices of up to ``most`` poses that differ from each other, best first."""
+    kept: list[int] = []
+    left = np.argsort(-scores, kind="stable")
+    while len(left) and len(kept) < most:
+        best, left = int(left[0]), left[1:]
+        kept.append(best)
+        left = left[~alike(poses[best : best + 1], poses[left], looks)[0]]
+    return kept
 
 
 def alike(some: Floats, others: Floats, looks: Looks) -> Mask:

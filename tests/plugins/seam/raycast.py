@@ -33,9 +33,10 @@ class Plate:
         enter = np.where(rate < 0, at, -np.inf)
         leave = np.where(rate > 0, at, np.inf)
         outside = ((rate == 0) & (away < 0)).any(axis=0)
-        first, face = enter.max(axis=0), enter.argmax(axis=0)
+        first, normals = enter.max(axis=0), np.zeros(directions.shape)
         hit = (first < leave.min(axis=0)) & (first > 1e-6) & ~outside
-        return np.where(hit, first, np.inf), self.normals[face]
+        normals[hit] = self.normals[enter[:, hit].argmax(axis=0)]
+        return np.where(hit, first, np.inf), normals
 
     def moved(self, pose):
         normals = self.normals @ pose[:3, :3].T

@@ -15,6 +15,7 @@ from flangeye.models.workpiece import load_workpiece
 from flangeye.types import CAMERA, Box, PointCloud, WorkpieceScan
 from flangeye.types.geometry import rigid, rotation_from_rpy, rotation_log
 from flangeye_emulators.scan import SimulatedScanParams
+from flangeye_plugins.body.looks import Looks
 from flangeye_plugins.seam.cad import CadParams, seam_cad
 from flangeye_plugins.seam.register import Registered, register
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned, write_plate
@@ -37,6 +38,18 @@ def registered_once(monkeypatch: pytest.MonkeyPatch) -> None:
         return FOUND[key]
 
     monkeypatch.setattr("flangeye_plugins.seam.cad.register", registered)
+    monkeypatch.setattr("flangeye_plugins.seam.register.Looks", looks_of)
+
+
+SEEN: dict[Any, Looks] = {}
+
+
+def looks_of(vertices, triangles):
+    """Prepare equal parts once."""
+    key = vertices.tobytes(), triangles.tobytes()
+    if key not in SEEN:
+        SEEN[key] = Looks(vertices, triangles)
+    return SEEN[key]
 
 
 @lru_cache

@@ -51,7 +51,7 @@ def test_fifty_scans_of_a_joint(joint: str) -> None:
 @cache
 def plain_plate():
     plate = [prism([(-60 * MM, -10 * MM), (60 * MM, -10 * MM), (60 * MM, 0), (-60 * MM, 0)])]
-    return scan_of("plate", 1, plates=(plate, (-60 * MM, 60 * MM)))
+    return scan_of("plate", 1, pitch=0.5 * MM, plates=(plate, (-60 * MM, 60 * MM)))
 
 
 @pytest.mark.parametrize("joint", JOINTS)
@@ -68,7 +68,7 @@ def test_a_plain_plate_is_no_joint(joint: str) -> None:
 )
 def test_another_joint_is_refused(scanned: str, asked: str) -> None:
     with pytest.raises(CalibrationRefused, match="seam.joint: "):
-        planned(scan_of(scanned, 0), asked)
+        planned(scan_of(scanned, 0, pitch=0.5 * MM), asked)
 
 
 def test_the_opening_is_half_way_between_what_meets() -> None:
@@ -204,7 +204,7 @@ def test_a_pipe_on_a_plate_is_closed_and_seen_from_around_it() -> None:
             spin @ lean @ np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.6], [0, 0, 0, 1.0]])
         )
         bodies = [plate.moved(np.linalg.inv(stands)) for plate in plates[0]]
-        clouds.append(seen_by(bodies, 0.7 * MM / 0.6))
+        clouds.append(seen_by(bodies, 0.7 * MM / 0.6, half=0.08))
         places.append(ScanPlace(len(clouds[-1]), stands, np.zeros(6)))
     covariance = np.diag([1e-10] * 6)
     camera = TransformEstimate(Transform(FLANGE, CAMERA, np.eye(4)), covariance, np.zeros(3))
