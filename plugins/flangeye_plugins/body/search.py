@@ -393,7 +393,7 @@ class BodySearch:
         return self.near(self.looks.reflections(found.pose), 0.9 * found.verdict.agree)
 
     def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
-        """Return the poses for which no rival explains the same cells and one more patch."""
+        """Return the poses that no rival dominates: none explains their cells and a patch more."""
         own, others = ([self._agreeing(one.pose) for one in each] for each in (found, rivals))
         return [
             one for one, cells in zip(found, own, strict=True)

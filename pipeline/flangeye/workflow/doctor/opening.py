@@ -46,7 +46,7 @@ from flangeye.workflow.run.runner import Runner
 
 
 class State(NamedTuple):
-    """The arms' further records: joints (n,) [rad], and base2_T_flange2 (4, 4) [m]."""
+    """Optional records of a sample: joint angles (n,) [rad], base2_T_flange2 (4, 4) [m]."""
 
     joints: Floats | None
     second: Floats | None
