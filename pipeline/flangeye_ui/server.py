@@ -214,7 +214,12 @@ class Gate:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
         elif (answer := self._answer(scope, Headers(scope=scope))) is None:
-            await self._app(self._inside(scope), receive, _guarded(send))
+            try:
+                await self._app(self._inside(scope), receive, _guarded(send))
+            except RuntimeError as error:
+                # What Starlette says of a page that was closed before its answer
+                if str(error) != "No response returned.":
+                    raise
         elif scope["type"] == "http":
             await answer(scope, receive, _guarded(send))
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import http.server
 import os
@@ -10,7 +11,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from flangeye.errors import StageError
 from flangeye.plugin.registry import load_registry
 from flangeye.workflow.recipe.find import find_recipe
 from flangeye_ui.project import MoveCodes, Project
+from flangeye_ui.server import Gate, Keys
 from tests.ui.conftest import Served, ended, serve
 
 HOSTILE = """<!doctype html><title>loading</title><script>
@@ -62,6 +64,21 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     served = serve(folder)
     yield served
     ended(served)
+
+
+@pytest.mark.parametrize("reason", ["No response returned.", "another"])
+def test_a_page_closed_before_its_answer_is_no_error(reason: str) -> None:
+    async def closed(*_: Any) -> None:
+        raise RuntimeError(reason)
+
+    keys = Keys(lambda token: None)
+    cookie = (keys.exchange(keys.token) or "").partition(";")[0]
+    headers = [(b"host", b"localhost:80"), (b"cookie", cookie.encode())]
+    asked = {"type": "http", "method": "GET", "path": f"{keys.path}/", "query_string": b"",
+             "headers": headers}  # fmt: skip
+    expected = pytest.raises(RuntimeError) if reason == "another" else nullcontext()
+    with expected:
+        asyncio.run(Gate(closed, keys, "127.0.0.1", 80)(asked, None, None))
 
 
 class Answer:
