@@ -72,6 +72,9 @@ def main() -> None:
     parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--fault", nargs="+", default=[])
     asked = parser.parse_args()
+    known = {fault for kind in asked.kind for fault in KINDS[kind]}
+    if unknown := set(asked.fault) - known:
+        parser.error(f"--fault {', '.join(unknown)}: not one of {', '.join(sorted(known))}")
     print(
         "kind         fault                   times  went on  rest [s]  exit [s]  no core [s]  "
         "resumed  wrong",
