@@ -6,9 +6,9 @@ sample over the rooms below, each in a copy of the repository, under those fast 
 line (coverage.py says which, and is asked anew for a file of tests that has changed, into
 build/mutation), the file's own first, then the fastest: in a fork of a process that has them
 collected (tools/trying.py). A change of what is computed at import, or of a line that runs in
-processes of the tests alone, is tried in a new process as well. What the files
-named by --tests leave alive is tried under the room's other files too, in a new process: coverage
-would make whole calibrations too slow. A change that fails no test is a survivor: its place and what was changed are
+processes of the tests alone, is tried in a new process as well. What the files named by --tests
+leave alive is tried under the room's other files too, in a new process: coverage would make whole
+calibrations too slow. A change that fails no test is a survivor: its place and what was changed are
 printed, and the share that was killed.
 """
 

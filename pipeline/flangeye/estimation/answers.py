@@ -159,8 +159,8 @@ class _Commands:
     def _explained(self, by: Floats, moved: Floats) -> Floats:
         """Return (B, 6, K): twists ``moved`` (W, 6, K), fitted over each box by least squares."""
         # Turns count like what they do so far from the flange [m]: enough to determine the turn
-        # about a line where the work is in one, and no more, for the work is at positions.
-        # With ten times as much, those of an arm of 3 mrad move the answer by its stated error
+        # about a line where the work is in one, and no more, for the work is at positions. At 20 mm
+        # an arm of 3 mrad turned the answer by 0.15 mrad, as much as 60 poses leave uncertain
         weight = np.repeat([0.002, 1.0], 3)[:, None]
         across = np.swapaxes(weight**2 * by, 1, 2)
         gram, right = (np.tensordot(self.boxes, across @ each, axes=1) for each in (by, moved))
