@@ -275,7 +275,7 @@ def predicted_work(found: Estimate, work: Work) -> PredictedWork:
     rows = model.design[:, 3:]
     moved = np.flatnonzero(rows.any(axis=(0, 1)))
     lasting, drawn, squares = rows[:, :, moved], [], []
-    for each in known.fits:
+    for each in known.draws.fits:
         noise = model.noise(each.sizes)[:, 3:, 3:]
         covariance = spread_of(lasting, each.covariance[np.ix_(moved, moved)]) + noise
         # A nanometre keeps the root real where a prediction has no error along an axis
@@ -283,8 +283,8 @@ def predicted_work(found: Estimate, work: Work) -> PredictedWork:
         # Eight of an error at each pose and each draw of the sizes, for its quantiles
         drawn.append((root @ rng.standard_normal((8, len(rows), 3, 1)))[..., 0])
         squares.append(np.trace(covariance, axis1=1, axis2=2).mean())
-    means = np.array([rows @ each.mean for each in known.fits])
-    return PredictedWork(rows, known.chances, means, np.array(drawn), np.array(squares))
+    means = np.array([rows @ each.mean for each in known.draws.fits])
+    return PredictedWork(rows, known.draws.chances, means, np.array(drawn), np.array(squares))
 
 
 def expected_error(

@@ -58,14 +58,14 @@ class Estimate:
 
     def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
         """Return the effects of one kind, each with the mean and covariance of its parameters."""
-        out, at = [], self.posterior.model.p
-        for effect, count in zip(self.effects, self.counts, strict=True):
-            rows = slice(at, at + count)
-            if effect.kind == kind:
-                known = self.posterior
-                out.append((effect, known.mean[rows], known.covariance[rows, rows]))
-            at += count
-        return out
+        known = self.posterior
+        return [(e, known.mean[at], known.covariance[at, at]) for e, at in self.rows(kind)]
+
+    def rows(self, kind: str) -> list[tuple[Effect, slice]]:
+        """Return the effects of one kind, each with the rows of its parameters."""
+        ends = np.cumsum([self.posterior.model.p, *self.counts])
+        every = zip(self.effects, map(slice, ends[:-1], ends[1:]), strict=True)
+        return [(effect, at) for effect, at in every if effect.kind == kind]
 
     def outgrown(self, kind: str, deviations: float = 2.0) -> bool:
         """Whether an effect's estimated size exceeds its prior median by ``deviations`` (sigma)."""

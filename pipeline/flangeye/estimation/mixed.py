@@ -17,9 +17,9 @@ linear in N. Arrays only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -274,6 +274,18 @@ def spread_of(rows: Floats, covariance: Floats) -> Floats:
     return np.asarray(flat.reshape(rows.shape) @ np.swapaxes(rows, 1, 2))
 
 
+class Draws(NamedTuple):
+    """Fits at sizes drawn from their posterior.
+
+    Attributes:
+        fits: One fit for each draw.
+        chances: (F,) weights of the draws; they sum to one.
+    """
+
+    fits: tuple[Fit, ...]
+    chances: Floats
+
+
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Joint posterior of places and effects: a mixture of Gaussians over the sizes.
@@ -281,42 +293,49 @@ class Posterior:
     Attributes:
         model: The linearised sightings.
         mode: The fit at the most likely sizes.
-        fits: One fit for each draw of the sizes.
-        chances: (F,) weights of the draws; they sum to one.
+        draw: Draws the sizes, when they are first needed: a likelihood needs the mode alone.
         cost: -2 log of the restricted likelihood times the sizes' prior at the mode, up to a
             constant.
     """
 
     model: LinearModel
     mode: Fit
-    fits: tuple[Fit, ...]
-    chances: Floats
+    draw: Callable[[], Draws]
     cost: float
+
+    @cached_property
+    def draws(self) -> Draws:
+        """The fits at sizes drawn from their posterior."""
+        return self.draw()
 
     @cached_property
     def mean(self) -> Floats:
         """Mean (P + K,) of places and effects."""
-        return np.asarray(sum(c * f.mean for c, f in zip(self.chances, self.fits, strict=True)))
+        return np.asarray(sum(c * f.mean for f, c in zip(*self.draws, strict=True)))
 
     @cached_property
     def covariance(self) -> Floats:
         """Covariance (P + K, P + K) of the mixture about its mean."""
-        within = sum(c * f.covariance for c, f in zip(self.chances, self.fits, strict=True))
-        apart = np.array([f.mean - self.mean for f in self.fits])
-        return np.asarray(within + (apart.T * self.chances) @ apart)
+        fits, chances = self.draws
+        within = sum(c * f.covariance for f, c in zip(fits, chances, strict=True))
+        apart = np.array([f.mean - self.mean for f in fits])
+        return np.asarray(within + (apart.T * chances) @ apart)
 
     def without(self, rows: Indices) -> Posterior:
         """Return the estimate without some sightings in closed form; variance components stay."""
         shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
-        mode, *fits = _without(taken, [self.mode, *self.fits])
-        left = self.model.weighted(shares)
-        return replace(self, model=left, mode=mode, fits=tuple(fits))
+        mode, *fits = _without(taken, [self.mode, *self.draws.fits])
+        return self._with(self.model.weighted(shares), mode, fits)
 
     def refitted(self, model: LinearModel) -> Posterior:
         """Return the estimate by another model of the sightings; variance components stay."""
-        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.fits))
-        return replace(self, model=model, mode=mode, fits=tuple(fits))
+        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.draws.fits))
+        return self._with(model, mode, fits)
+
+    def _with(self, model: LinearModel, mode: Fit, fits: Sequence[Fit]) -> Posterior:
+        draws = Draws(tuple(fits), self.draws.chances)
+        return replace(self, model=model, mode=mode, draw=lambda: draws)
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
@@ -329,12 +348,13 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
         Covariances (E, A, A) from each effect, and (A, A) from the noise.
     """
     effect, p = known.model.sizes.effect, known.model.p
-    moved = np.array([rows @ each.covariance for each in known.fits])
-    sizes = np.array([each.sizes[effect] for each in known.fits])
-    scaled = moved[:, :, p:] * (np.sqrt(known.chances)[:, None] / sizes)[:, None]
+    fits, chances = known.draws
+    moved = np.array([rows @ each.covariance for each in fits])
+    sizes = np.array([each.sizes[effect] for each in fits])
+    scaled = moved[:, :, p:] * (np.sqrt(chances)[:, None] / sizes)[:, None]
     parts = (scaled[:, :, effect == k] for k in range(int(effect.max(initial=-1)) + 1))
     of_effects = np.array([np.tensordot(each, each, axes=((0, 2), (0, 2))) for each in parts])
-    whole = np.tensordot(known.chances, moved, axes=1) @ rows.T
+    whole = np.tensordot(chances, moved, axes=1) @ rows.T
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
@@ -388,6 +408,12 @@ def _better(model: LinearModel, z: Floats, here: Fit, step: Floats) -> tuple[Flo
 
 def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
     """Return the joint posterior, with the sizes marginalised by sampling about their mode."""
+    cost = at_mode.cost + float(mode.z @ mode.z)
+    return Posterior(model, at_mode, partial(_drawn, model, mode, at_mode), cost)
+
+
+def _drawn(model: LinearModel, mode: Peak, at_mode: Fit) -> Draws:
+    """Return the fits at sizes drawn about their mode, weighed by their posterior."""
     (z, spread), some, prior = mode, model.subsampled(), model.sizes
     fits, logs = [], []
     # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
@@ -409,8 +435,7 @@ def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
             sizes = each.sizes.copy()
             sizes[own] = at_mode.sizes[own]
             fits[k] = _solved(model, sizes, at_mode.information, at_mode.right)
-    cost = at_mode.cost + float(z @ z)
-    return Posterior(model, at_mode, tuple(fits), chances / chances.sum(), cost)
+    return Draws(tuple(fits), chances / chances.sum())
 
 
 def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:

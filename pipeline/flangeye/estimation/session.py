@@ -455,12 +455,9 @@ def _require_size(session: Session) -> None:
         CalibrationRefused: A size or focal length contradicts it; the message has the better
             estimate.
     """
-    told = [
-        (float(mean[0]), float(np.sqrt(covariance[0, 0])), kind)
-        for kind in ("size", "focal")
-        for _, mean, covariance in session.found.numbers(kind)
-    ]
-    if not told:
+    found, kinds = session.found, ("size", "focal")
+    likeliest = [abs(found.fit.mean[at][0]) for kind in kinds for _, at in found.rows(kind)]
+    if not likeliest:
         return
     if gross := _size_far_off(session):
         raise CalibrationRefused(
@@ -468,10 +465,15 @@ def _require_size(session: Session) -> None:
             "its fit step states",
             "measure the print (target_size: unknown finds it)",
         )
+    if max(likeliest) <= session.asked.size_limit:
+        return
+    told = [
+        (float(mean[0]), float(np.sqrt(covariance[0, 0])), kind)
+        for kind in kinds
+        for _, mean, covariance in found.numbers(kind)
+    ]
     share, sigma, kind = max(told, key=lambda each: abs(each[0]) / each[1])
-    if abs(share) <= session.asked.size_limit or (share / sigma) ** 2 < chi2_quantile(
-        1 - MISFIT, 1
-    ):
+    if (share / sigma) ** 2 < chi2_quantile(1 - MISFIT, 1):
         return
     factor = f"{1 + share:.4f} +- {sigma:.4f} times as"
     if kind == "size":
