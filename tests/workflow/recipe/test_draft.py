@@ -540,6 +540,12 @@ def odd_heading(folder):
     table(folder, "u,v,w,alpha,beta,gamma", kuka)
 
 
+def arm_of_unknown_words(folder):
+    names = ",".join(f"marker_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+    heading = f"X Kipp,Y Kipp,Z Kipp,Kipp 1,Kipp 2,Kipp 3,{names}"
+    table(folder, heading, lambda *pose: [*kuka(*pose), *quaternion(*pose)])
+
+
 def tables_of_other_lengths(folder):
     for name in ("robot.csv", "marker.csv"):
         table(folder, "", quaternion, name=name)
@@ -646,6 +652,7 @@ def two_poses_of_nobody(folder):
         (deep, [], "rec: its files are in nested folders, such as a/1/robot.csv; name the folder "
          "of one session: flangeye init rec/a"),
         (alone, [], "rec/board.csv: has what the camera measured, but no poses of the arm; put its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"),
+        (arm_of_unknown_words, [], "rec/log.csv: has what the camera measured, but no poses of the arm; put its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"),
         (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; give each "
          "a column time to join them by it, or remove the surplus"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "

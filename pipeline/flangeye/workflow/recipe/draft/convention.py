@@ -42,6 +42,7 @@ from flangeye.workflow.recipe.draft.headings import (
     is_inverse,
     named_parent_first,
     poses_by_name,
+    role_in,
 )
 from flangeye.workflow.recipe.draft.survey import Questions, one_of
 
@@ -183,7 +184,9 @@ def _arm(
     if joints:
         poses = angles or [as_joints(p) for p in poses]
     else:
-        poses = [p for p in poses if p.role != "target"] or angles or poses
+        # A file may be called after the camera and hold the arm's poses; columns say whose they are
+        unclaimed = [p for p in poses if role_in(p.called) != "target"]
+        poses = [p for p in poses if p.role != "target"] or angles or unclaimed
     if asked is not None:
         for pose in poses:
             if asked in (pose.name, pose.table.name):
@@ -191,7 +194,8 @@ def _arm(
         known = ", ".join([pose.name for pose in poses] or [table.name for table in tables])
         raise RecipeError(f"--table {asked}: is not a table of poses; known: {known}")
     if not poses:
-        raise RecipeError(_unplain(tables[0]))
+        seen = next((p for p in found if p.is_pose), None)
+        raise RecipeError(_alone(seen) if seen else _unplain(tables[0]))
     return _likeliest(poses, questions)
 
 
@@ -309,6 +313,11 @@ def _target(
     if len(whole) > 1:
         rest = ", ".join(p.name for p in whole[1:])
         questions.assumed.append(f"what the camera saw: {whole[0].name}, not {rest}")
+    elif whole and whole[0].role is None and not whole[0].is_pose:
+        questions.assumed.append(
+            f"what the camera saw: the points {', '.join(map(str, whole[0].columns))} of "
+            f"{whole[0].table.name} (--target-columns changes it)"
+        )
     return whole[0] if whole else None
 
 
