@@ -1,6 +1,7 @@
 """Read only regular files of bounded size; write files atomically."""
 
 import os
+import re
 import stat
 import tempfile
 from contextlib import suppress
@@ -106,7 +107,7 @@ def read_text(path: Path, limit: int = MAX_TEXT, error: type[FlangeyeError] = St
 
 
 def read_any_text(path: Path) -> str:
-    """Return a text file decoded as UTF-8, UTF-16 (Excel), or else Latin-1.
+    """Return a text file decoded as UTF-8, UTF-16 (Excel), GB 18030 (Chinese), or else Latin-1.
 
     Raises:
         StageError: As :func:`read_regular`, or it is not text.
@@ -119,7 +120,9 @@ def read_any_text(path: Path) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
-        return raw.decode("latin-1")
+        # Of Latin-1, letters beyond ASCII stand alone; of Chinese each has two such bytes
+        chinese = re.fullmatch(rb"(?:[\0-\x7f]++|[\xa1-\xd7][\xa1-\xfe])*+", raw)
+        return raw.decode("gb18030" if chinese else "latin-1", "replace")
 
 
 def _reason(failure: Exception) -> str:

@@ -172,24 +172,33 @@ def readings_of(own: Table, given: ColumnsParams, taken: Sequence[Column] = ()) 
     width = max(len(cells) for _, cells in own.rows)  # empty last cells are not counted
     free = [i for i in range(width) if i not in other]
     columns = own.indices(given.columns) or free
-    values = [
-        None
-        if _is_unseen(cells, columns, given.rotation != POINT)
-        else _value(own, row, columns, given)
-        for row, (_, cells) in enumerate(own.rows)
-    ]
+    values = poses_in(own, columns, given, zeros=given.rotation != POINT)
     return Readings(own, values, times_of(own, given.time, given.time_unit))
 
 
-def _is_unseen(cells: Sequence[Cell], columns: Sequence[int], whole: bool) -> bool:
-    """Return whether a row has no measurement: empty cells, or an all-zero ``whole`` pose."""
+def poses_in(
+    own: Table, columns: Sequence[int], given: WrittenParams, zeros: bool
+) -> list[Floats | None]:
+    """Return the pose or point of each row; None for empty cells, and for ``zeros`` only.
+
+    Raises:
+        StageError: A cell is not a number, or the numbers are not a pose.
+    """
+    return [
+        None if _is_unseen(cells, columns, zeros) else _value(own, row, columns, given)
+        for row, (_, cells) in enumerate(own.rows)
+    ]
+
+
+def _is_unseen(cells: Sequence[Cell], columns: Sequence[int], zeros: bool) -> bool:
+    """Return whether a row has no measurement: empty cells, or ``zeros`` only."""
     filled = [cells[c] for c in columns if c < len(cells)]
     if all(str(cell).strip().lower() in ("", "nan") for cell in filled):
         return True
-    return whole and len(filled) == len(columns) and all(number_of(cell) == 0 for cell in filled)
+    return zeros and len(filled) == len(columns) and all(number_of(cell) == 0 for cell in filled)
 
 
-def _value(own: Table, row: int, columns: Sequence[int], given: ColumnsParams) -> Floats:
+def _value(own: Table, row: int, columns: Sequence[int], given: WrittenParams) -> Floats:
     one = replace(own, rows=(own.rows[row],))
     return given.value(own.where(row), one.numbers(columns)[0])
 

@@ -44,6 +44,7 @@ from flangeye_plugins.reader.columns import (
     JointsParams,
     Readings,
     SeenPoseParams,
+    poses_in,
     readings_of,
     table_with_rows,
     times_of,
@@ -129,16 +130,33 @@ def table(path: Path, params: TableParams, kinematics: RobotModel | None = None)
     text = table_with_rows(folder, name)
     poses = _arm_poses(text, params, kinematics)
     if params.target is None:
-        return _with_scans(folder, text, poses, params)
-    return _measured(folder, text, poses, params)
+        return _with_poses(_with_scans(folder, text, poses, params), text, poses)
+    return _with_poses(_measured(folder, text, poses, params), text, poses)
+
+
+def _with_poses(archive: Archive, text: Table, poses: Floats) -> Archive:
+    """Return an archive without the rows that have no pose of the arm, and a note on those.
+
+    Raises:
+        StageError: No row has one.
+    """
+    gone = [text.where(i) for i, pose in enumerate(poses) if not np.isfinite(pose).all()]
+    if len(gone) == len(poses):
+        raise StageError(f"{text.file}: no row has a pose of the arm; all are empty or nan")
+    if not gone:
+        return archive
+    kept = [r for r in archive.recordings if np.isfinite(r.base_T_flange).all()]
+    note = f"left out {len(gone)} of {len(poses)} rows without a pose of the arm: {gone[0]}"
+    return replace(archive, recordings=kept, notes=[*archive.notes, note])
 
 
 def _arm_poses(text: Table, params: TableParams, robot: RobotModel | None) -> Floats:
-    """Return the flange's poses (N, 4, 4) [m]: as written, or from the joint angles."""
+    """Return the flange's poses (N, 4, 4) [m], as written or from the joints; NaN in empty rows."""
     if params.rotation == BY_JOINTS:
         return _at_joints(text, params.angles(text), robot)
-    values = text.numbers(_columns(text, params, _scan_column(text, params)))
-    poses = np.array([params.value(text.where(i), row) for i, row in enumerate(values)])
+    columns = _columns(text, params, _scan_column(text, params))
+    values = poses_in(text, columns, params, zeros=False)
+    poses = np.array([np.full((4, 4), np.nan) if pose is None else pose for pose in values])
     return poses if params.pose == "base_T_flange" else inverted(poses)
 
 
@@ -259,13 +277,16 @@ def _measured(folder: Path, text: Table, poses: Floats, params: TableParams) -> 
     joints = params.angles(text)
     # Separate tables with times have their own clocks and rates; rows of one table belong together
     if times is not None and target.times is not None and target.table is not text:
-        recordings, notes = _joined((times, poses), target, second, params)
+        known = np.isfinite(poses).all(axis=(1, 2))
+        recordings, notes = _joined((times[known], poses[known]), target, second, params)
         recordings = _with_joints(recordings, times, joints)
     else:
         others, notes = [target, *([second] if second else [])], []
         for at, other in enumerate(others):
             order, notes = rows_together(text, other.table, params.scan)
-            others[at] = other._replace(values=[other.values[i] for i in order])
+            others[at] = other._replace(
+                values=[None if i is None else other.values[i] for i in order]
+            )
         recordings = _row_by_row(text, times, poses, others)
         if joints is not None:
             recordings = [replace(r, joints=at) for r, at in zip(recordings, joints, strict=True)]

@@ -663,6 +663,85 @@ def times_before_six(f, j, a, s):
         (f / f"{name}.txt").write_text("\n".join(" ".join(map(str, row)) for row in rows))
 
 
+def cells_in(rows, number, mark=";"):
+    return [mark.join([str(i), *map(number, row)]) for i, row in enumerate(rows, 1)]
+
+
+def comma(x):
+    return f"{x:.5f}".replace(".", ",")
+
+
+def german(f, j, a, s):
+    arm = "X Position [mm]\tY Position [mm]\tZ Position [mm]\tDrehung A [Grad]\tDrehung B [Grad]\tDrehung C [Grad]"
+    seen = "\t".join(f"Marker {name}" for name in ["X [mm]", "Y [mm]", "Z [mm]", *NAMES[3:]])
+    rows = np.hstack([euler(a, "ZYX"), 1e3 * quaternion(s)[:, :3], quaternion(s)[:, 3:]])
+    lines = [f"Aufnahme\t{arm}\t{seen}", *cells_in(rows, comma, "\t")]
+    (f / "Messung.txt").write_text("\r\n".join(lines), "utf-16")
+
+
+def chinese(f, j, a, s):
+    sides = (f"{side}{axis}" for side in ("机器人", "标定板")
+             for axis in ("X(mm)", "Y(mm)", "Z(mm)", "RX(度)", "RY(度)", "RZ(度)"))  # fmt: skip
+    rows = cells_in(np.hstack([euler(a, "xyz"), euler(s, "xyz")]), "{:.4f}".format, ",")
+    (f / "数据.csv").write_text("\n".join([",".join(["序号", *sides]), *rows]), "gb18030")
+
+
+def chinese_quaternions(f, j, a, s):
+    heading = "序号,位置X/毫米,位置Y/毫米,位置Z/毫米,四元数W,四元数X,四元数Y,四元数Z"
+    for name, poses in (("机器人位姿", a), ("标定板位姿", s)):
+        rows = quaternion(poses)[:, [0, 1, 2, 6, 3, 4, 5]] * np.repeat([1e3, 1], [3, 4])
+        lines = [heading, *cells_in(rows, "{:.7f}".format, ",")]
+        (f / f"{name}.csv").write_text("\n".join(lines), "utf-8-sig")
+
+
+def french(f, j, a, s):
+    sides = (f"{word} {axis} ({unit})" for words in (("Position", "Rotation"), ("Mire", "Mire"))
+             for word, axes, unit in zip(words, ("X Y Z", "RX RY RZ"), ("mm", "°"), strict=True)
+             for axis in axes.split())  # fmt: skip
+    rows = cells_in(np.hstack([euler(a, "xyz"), euler(s, "xyz")]), comma)
+    (f / "mesures.csv").write_text("\n".join([";".join(["n°", *sides]), *rows]), "cp1252")
+
+
+def spanish(f, j, a, s):
+    heading = "Nº;Posición X;Posición Y;Posición Z;Giro X;Giro Y;Giro Z"
+    for name, poses in (("robot", a), ("marcador", s)):
+        lines = [heading, *cells_in(euler(poses, "xyz"), comma)]
+        (f / f"{name}.csv").write_text("\n".join(lines), "cp1252")
+
+
+def thousands(f, j, a, s):
+    def printed(x):
+        return f"{x:,.3f}".translate(str.maketrans(",.", ".,"))
+
+    far = rigid(np.eye(3), np.array([-0.9, 0.8, 1.0])) @ a  # so that the base is a metre away
+    rows = cells_in(np.hstack([euler(far, "ZYX"), euler(s, "ZYX")]), printed)
+    heading = "Nr;X;Y;Z;A;B;C;Ziel X;Ziel Y;Ziel Z;Ziel A;Ziel B;Ziel C"
+    (f / "Werte.csv").write_text("\n".join([heading, *rows]))
+
+
+def other_comments(f, j, a, s):
+    lines = text(np.hstack([quaternion(a), quaternion(s)]), " ").splitlines()
+    told = ["; by hand on line 4", "! first the arm, then the marker", ""]
+    (f / "poses.txt").write_text("\n".join([*told, *(f"{line}  ! shot" for line in lines)]))
+
+
+def gaps(f, j, a, s):
+    heading = ",".join(["name", *NAMES, *(f"target_{name}" for name in NAMES)])
+    rows = cells_in(np.hstack([quaternion(a), quaternion(s)]), "{:.7f}".format, ",")
+    rows[3:3] = [",".join(["25", *["nan"] * 14])]
+    rows[9:9] = [""]
+    (f / "log.csv").write_text("\n".join([heading, *(f"img{row}" * bool(row) for row in rows)]))
+
+
+def names_of_images(f, j, a, s):
+    for name, poses, kept in (("robot", a, COUNT), ("marker", s[2:], COUNT - 2)):
+        rows = quaternion(poses)[:kept]
+        lines = [
+            f"{i + COUNT - kept:03}.png,{row}" for i, row in enumerate(text(rows).splitlines())
+        ]
+        (f / f"{name}.csv").write_text("\n".join([",".join(["frame", *NAMES]), *lines]))
+
+
 LAYOUTS: dict[str, Callable[..., None]] = {
     "two blocks of rows in one text, arm above marker": blocks,
     "the same without a line between them": halves,
@@ -751,6 +830,15 @@ LAYOUTS: dict[str, Callable[..., None]] = {
     "Metashape's `cameras.xml`": metashape,
     "JSON of `robot_positions`, `robot_quaternions`, …": apart_by_name,
     "a time before position and rotation vector, without a heading": times_before_six,
+    "German headings in UTF-16: Drehung A [Grad], Marker X [mm]": german,
+    "Chinese headings in GB 18030: 机器人X(mm), 标定板RX(度)": chinese,
+    "Chinese headings: 位置X/毫米, 四元数W, in `机器人位姿.csv` and `标定板位姿.csv`": chinese_quaternions,
+    "French headings: Rotation RX (°), Mire X (mm)": french,
+    "Spanish headings: Posición X, Giro X, in `robot.csv` and `marcador.csv`": spanish,
+    "marks between thousands, `1.234,56`": thousands,
+    "comments behind `;` and `!`": other_comments,
+    "a row of `nan`, and a blank line between rows": gaps,
+    "names of images, of which the marker's table lacks some": names_of_images,
 }
 """What is in the folder, and how it is written."""
 

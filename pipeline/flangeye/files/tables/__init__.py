@@ -57,8 +57,8 @@ __all__ = [
 ]
 
 
-_COMMENT = re.compile(r"(?<!\s)\s*(?:[#%]|//)[#%/ ]*")
-"""Mark at the beginning of a comment line."""
+_COMMENT = re.compile(r"(?<!\s)\s*(?:[#%!]|//|;(?=[^;]*$))[#%!;/ ]*")
+"""Mark at the beginning of a comment line; a semicolon separates cells if the line has more."""
 
 
 def program_rows(file: Path, text: str) -> Rows | None:
@@ -128,11 +128,11 @@ def tables_in(folder: Path, name: str) -> list[Table]:
 
 def rows_together(
     table: Table, other: Table, column: Column | None = None
-) -> tuple[list[int], list[str]]:
+) -> tuple[list[int | None], list[str]]:
     """Return the index of the other table's row for each row, and notes on how they were paired.
 
-    Rows are paired by name: that of their files, or the cell in a column that both tables have.
-    Without names they are paired row by row.
+    Rows are paired by name: that of their files, or the cell in a column that both tables have. A
+    name that the other table lacks has None. Without names they are paired row by row.
 
     Raises:
         StageError: The names differ, or the numbers of rows.
@@ -140,9 +140,20 @@ def rows_together(
     if other is table:
         return list(range(len(table.rows))), []
     names, others = _row_names(table, column), _row_names(other, column)
+    # Of numbers that are there on one side only, it is unknown whether both count from the same
+    if set(others) < set(names) and len(others) >= MIN_CAPTURES and not "".join(others).isdecimal():
+        at = {name: i for i, name in enumerate(others)}
+        lacks = [name for name in names if name not in at]
+        told = f"{', '.join(lacks[:3])}{', …' * (len(lacks) > 3)}"
+        return [at.get(name) for name in names], [
+            f"paired by name: {other.name} has {len(others)} of {len(names)} names, without {told}"
+        ]
     if names and others:
-        order, note = partners(str(table.file), names, others, f"rows of {other.name}")
-        return order, [note]
+        stems, other_stems = (
+            [re.sub(r"\.[A-Za-z]\w*$", "", name) for name in each] for each in (names, others)
+        )
+        order, note = partners(str(table.file), stems, other_stems, f"rows of {other.name}")
+        return list(order), [note]
     if len(other.rows) != len(table.rows):
         raise StageError(
             f"{other.file}: has {len(other.rows)} rows, {table.name} has {len(table.rows)}; "
@@ -152,7 +163,10 @@ def rows_together(
 
 
 def _row_names(table: Table, column: Column | None) -> Sequence[str]:
-    """Return the names of a table's rows; empty where they have none, or two have the same."""
+    """Return the names of a table's rows; empty where they have none, or two have the same.
+
+    A file has its ending.
+    """
     if table.names or column is None:
         return table.names
     known = column in table.heading or (isinstance(column, int) and column <= len(table.rows[0][1]))
@@ -162,7 +176,7 @@ def _row_names(table: Table, column: Column | None) -> Sequence[str]:
         called = all(cell.isdecimal() or number_of(cell) is None for cell in cells)
         files = known or all(PurePath(cell).suffix for cell in cells)
         if called and files and len(set(cells)) == len(table.rows):
-            return [PurePath(cell).stem for cell in cells]
+            return [PurePath(cell).name for cell in cells]
     return ()
 
 
@@ -349,9 +363,9 @@ class TextBlock:
 def text_rows(file: Path, text: str) -> list[Rows]:
     """Return the blocks of a text, mostly one.
 
-    ``#``, ``%`` and ``//`` begin a comment; the last one before the numbers may be the heading.
-    Blocks of three rows or more are separated by blank lines and titles, and blocks of equal length
-    by comments. A matrix written over several lines becomes one row.
+    ``#``, ``%``, ``!``, ``;`` and ``//`` begin a comment; the last one before the numbers may be
+    the heading. Blocks of three rows or more are separated by blank lines and titles, and blocks of
+    equal length by comments. A matrix written over several lines becomes one row.
     """
     blocks = [_with_matrices(_unfolded(block)) for block in _blocks(file, text.splitlines())]
     merged = _in_turn(blocks) or _merged(blocks)
@@ -381,7 +395,7 @@ def _blocks(file: Path, lines: Sequence[str]) -> Iterator[TextBlock]:
     for n, line in _unbroken(lines):
         comment = bool(_COMMENT.match(line))
         # What stands behind the numbers of a line is a remark
-        words = re.split(r"\s(?:#|//)", line)[0] if re.match(r"[-+.\d]", line) else line
+        words = re.split(r"\s(?:[#!]|//)", line)[0] if re.match(r"[-+.\d]", line) else line
         plain = _COMMENT.sub("", words, count=1) if comment else words
         cells = split(plain) if plain else ()
         counts = split.wide and len(cells) < 3  # rows, or what stands below: robot 7
@@ -474,7 +488,9 @@ def _merged(blocks: list[TextBlock]) -> list[TextBlock]:
     for block in blocks:
         last = sections[-1] if sections else None
         same = last is not None and block.width == last.width and not block.heading
-        begins = block.after_blank or alike
+        # Under a heading, rows behind a blank line go on; a second table would be as long
+        goes_on = last is not None and bool(last.heading) and len(block.rows) != len(last.rows)
+        begins = (block.after_blank and not goes_on) or alike
         if short:
             begins = bool(block.title) and not all_titled
         if last is None or not same or begins:

@@ -139,10 +139,24 @@ def entry_of_list(name: str) -> tuple[str, str] | None:
 
 
 def number_of(cell: Cell) -> float | None:
-    """Return the number in a cell, with decimal point or comma, or Fortran's 1.5D+02; else None."""
+    """Return the number in a cell, as spreadsheets and Fortran write it too; None for other text.
+
+    It may have a decimal comma, marks between thousands (1.234,5 and 1,234.5), a typographer's
+    minus, or the exponent of 1.5D+02.
+    """
     if not isinstance(cell, str):  # an integer of JSON can be larger than any float
         return cell if isinstance(cell, float) or abs(cell) < 10**300 else None
-    text = cell.replace(",", ".") if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", cell) else cell
+    try:
+        return float(cell)
+    except ValueError:
+        pass
+    text = cell.replace("\u2212", "-")
+    thousands = re.fullmatch(
+        r"([-+]?\d{1,3}(?:([.,'\u2019\u00a0\u202f])\d{3})(?:\2\d{3})*)([.,]\d+)", text
+    )
+    if thousands and thousands[2] != thousands[3][0]:
+        text = thousands[1].replace(thousands[2], "") + thousands[3]
+    text = text.replace(",", ".") if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", text) else text
     try:
         return float(re.sub(r"(?<=[\d.])[dD](?=[-+]?\d+$)", "e", text))
     except ValueError:

@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from flangeye.errors import RecipeError
+from flangeye.errors import RecipeError, StageError
 from flangeye.files.recording import MAX_REACH
 from flangeye.files.tables import Column, Table, read_table, rows_together
 from flangeye.maths.kinematics import Arm
@@ -148,6 +148,15 @@ def _require_as_many(tables: Sequence[Table], arm: PoseColumns) -> None:
     other = next((t for t in tables if t.files != arm.table.files), None)
     if other is not None and len(other.rows) != len(arm.table.rows):
         rows_together(arm.table, other, _row_names(arm.table, other))
+
+
+def _joined(table: Table, other: Table) -> bool:
+    """Return whether the rows of two tables belong together, by their names or one by one."""
+    try:
+        rows_together(table, other, _row_names(table, other))
+    except StageError:
+        return len(table.rows) == len(other.rows)
+    return True
 
 
 def _alone(arm: PoseColumns) -> str:
@@ -301,7 +310,7 @@ def _target(
     others = [
         p for p in found
         if p != arm and p.role != "arm" and p.rotations != JOINTS_ONLY
-        and (len(p.table.rows) == len(arm.table.rows)
+        and (_joined(arm.table, p.table)
              or (timed and poses_of(p.table)[1].time is not None))
     ]  # fmt: skip
     if not others and arm.role is None:
@@ -368,7 +377,7 @@ def _seen_together(
     Raises:
         RecipeError: Unnamed numbers fit neither, or the halves of a table are not arm and target.
     """
-    if target is None or not target.is_pose or len(arm.table.rows) != len(target.table.rows):
+    if target is None or not target.is_pose or not _joined(arm.table, target.table):
         return _within_reach(arm, robot), target
     tried = (
         (a, t, choice)
@@ -454,7 +463,9 @@ def _orders(pose: PoseColumns, questions: Questions, prefix: str) -> list[PoseCo
 def _both(arm: PoseColumns, target: PoseColumns) -> tuple[Floats, Floats]:
     """Return the numbers of arm and target in rows where both are complete."""
     order, _ = rows_together(arm.table, target.table, _row_names(arm.table, target.table))
-    numbers, seen = _numbers(arm), _numbers(target)[order]
+    numbers, rows = _numbers(arm), _numbers(target)
+    unseen = np.full(rows.shape[1], np.nan)
+    seen = np.array([unseen if row is None else rows[row] for row in order])
     kept = np.isfinite(numbers).all(axis=1) & np.isfinite(seen).all(axis=1)
     return numbers[kept], seen[kept]
 

@@ -8,7 +8,9 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
+from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES
 from flangeye.files.tables import Cell, Column, Table, entry_of_list, number_of
 from flangeye.models.robots import joints_in_order
 from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
@@ -278,6 +280,11 @@ def _first(table: Table, index: int) -> Cell:
 def _is_file(table: Table, index: int) -> bool:
     cell = str(_first(table, index))
     folder = table.files[0].parent
+    if len(set(table.texts(index))) == len(table.rows) and Path(cell).suffix.lower() in (
+        *CLOUD_SUFFIXES,
+        *IMAGES,
+    ):
+        return True  # a name that two tables share, though the file itself is elsewhere
     return bool(cell) and len(cell) < 200 and (folder / cell).is_file()
 
 
@@ -312,8 +319,9 @@ def _of_list(listed: str, axis: str) -> list[str]:
 
 def _words(name: str) -> list[str]:
     """Return the words of a column's name; R of ``R_gripper2base`` is one."""
-    words = [w for w in re.split(r"[^0-9a-zA-Z°]+", name.replace("°", "deg")) if w]
-    joined = " ".join(words)
+    # A unit's sign, or Chinese beside Latin letters, ends a word: 位置X(毫米)
+    apart = re.sub(r"([\u3400-\u9fff]+)", r" \1 ", in_english(name).replace("°", " deg "))
+    joined = in_english(" ".join(w for w in re.split(r"[\W_]+", apart) if w))
     for two, one in (
         (r"rot(?:ation)? vec(?:tor)?|axis angle", "rotvec"), (r"rot(?:ation)? quat\w*", "quat"),
         (r"trans(?:lation)? vec(?:tor)?", "tvec"), (r"rot(?:ation)? mat(?:rix)?", "rotation"),
@@ -473,8 +481,26 @@ def is_inverse(frames: tuple[str, str]) -> bool:
     return frames[0] == "flange" or frames[1] == "camera"
 
 
+def in_english(name: str) -> str:
+    """Return a name with the German, French, Spanish and Chinese words of poses in English."""
+    for chinese, english in (
+        ("四元数", "quaternion"), ("旋转|姿态", "rotation"), ("位置|坐标|位姿", "position"),
+        ("角度", "angle"), ("弧度", "rad"), ("毫米", "mm"), ("厘米", "cm"), ("序号|编号", "no"),
+        ("时间", "time"), ("标定板|标记|相机", "target"), ("机器人|机械臂|法兰|末端", "robot"),
+    ):  # fmt: skip
+        name = re.sub(chinese, f" {english} ", name)
+    for words, english in (
+        ("drehung|giro|rotación|rotacion", "rotation"), ("posición|posicion|lage", "position"),
+        ("grad|grados|degrés|degrees|度", "deg"), ("米", "m"), (r"n[°º]|№", "no"),
+        ("ziel|zielmarke|mire|cible|marcador|marqueur", "target"), ("roboter|brazo", "robot"),
+    ):  # fmt: skip
+        name = re.sub(rf"(?<![^\W_])(?:{words})(?![^\W_])", english, name, flags=re.IGNORECASE)
+    return name
+
+
 def role_in(name: str) -> str | None:
     """Return ``arm`` or ``target`` by a name; None if it shows neither."""
+    name = in_english(name)
     frames = frames_in(name.rpartition(":")[2])
     if frames is not None:
         return "target" if "camera" in frames else "arm"
