@@ -50,6 +50,17 @@ def test_an_export_is_printed_or_written_elsewhere(exporting: Any, tmp_path: Pat
     assert "BASE_DATA[1]={X " in (tmp_path / "else" / "b.dat").read_text()
 
 
+def test_no_export_replaces_the_log_of_a_run(exporting: Any, tmp_path: Path) -> None:
+    assert exporting.ran(TOY_RECIPE)[0] == 0
+    recorded = (tmp_path / "here" / "run.mcap").read_bytes()
+    code, out, err = exporting("export", "here", "--to", "matrix", "--out", "here/run.mcap")
+    assert (code, out) == (2, "")
+    assert err == (
+        "error: here/run.mcap: is the log of a run, which is never replaced; name another file\n"
+    )
+    assert (tmp_path / "here" / "run.mcap").read_bytes() == recorded
+
+
 def test_a_refused_calibration_is_not_exported(exporting: Any, tmp_path: Path) -> None:
     assert exporting.ran(REFUSED + "  - export.zivid\n")[0] == 1
     assert not (tmp_path / "here" / "exports").exists()

@@ -138,8 +138,11 @@ def write_whole(path: Path, content: str | bytes, error: type[FlangeyeError] = S
         error: Type of the error to raise.
 
     Raises:
-        FlangeyeError: The file cannot be written.
+        FlangeyeError: The file cannot be written, or is the log of a run.
     """
+    # What was recorded cannot be made again, unlike all that is written from it
+    if path.is_file() and _begins_as_log(path):
+        raise error(f"{path}: is the log of a run, which is never replaced; name another file")
     raw = content.encode("utf-8", "replace") if isinstance(content, str) else content
     try:
         if not path.parent.exists():
@@ -150,6 +153,15 @@ def write_whole(path: Path, content: str | bytes, error: type[FlangeyeError] = S
             _replace(path, raw)
     except OSError as failure:
         raise error(f"{path}: cannot be written: {failure.strerror or failure}") from None
+
+
+def _begins_as_log(path: Path) -> bool:
+    magic = b"\x89MCAP0\r\n"
+    try:
+        with path.open("rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError:
+        return False
 
 
 def _replace(path: Path, raw: bytes) -> None:
