@@ -23,10 +23,22 @@ WHOLE = PlainSerializer(lambda path: str(path.absolute()), return_type=str, when
 """How a path is written into a resolved recipe: it is the same from any folder."""
 
 
+def at_home(value: str | Path) -> Path:
+    """Return a path in which ``~`` is the home folder.
+
+    Raises:
+        ValueError: It begins with the name of a user that this machine does not have.
+    """
+    try:
+        return Path(value).expanduser()
+    except RuntimeError:
+        raise ValueError("~ and a name is the home folder of a user of this machine") from None
+
+
 def _beside_recipe(value: Any, info: ValidationInfo) -> Path:
     if not isinstance(value, (str, Path)):
         raise ValueError("a path is text")
-    path = Path(value).expanduser()
+    path = at_home(value)
     if any(len(os.fsencode(part)) > 255 for part in path.parts):  # NAME_MAX of Linux and others
         raise ValueError("a name in the path is longer than 255 bytes")
     return path if info.context is None else info.context.folder / path

@@ -30,6 +30,8 @@ def sentence(details: Any, model: type[Any], given: Any) -> str:
         is_now = {type(None): "holds nothing", list: "is a list", str: "is a text"}
         what = is_now.get(type(given), f"is {given}")
         return f"{what}; it must be a mapping with the keys {fields}"
+    if details["type"] == "too_short" and not given:
+        return "is empty; at least one entry is needed"
     kind = str(details["type"]).partition("_")[0]
     kinds = {"tuple": "a list", "list": "a list", "int": "a whole number", "float": "a number"}
     kinds |= {"bool": "true or false", "string": "a text"}

@@ -176,7 +176,8 @@ class Registry:
             f"; plugin '{plugin}' could not be loaded ({type(error).__name__}: {error})"
             for plugin, error in self.broken.items()
         )
-        return PluginNotFoundError(f"no {sort} '{name}'{hint}{failed}")
+        called = name.replace("\n", r"\n")  # foreign text: one line
+        return PluginNotFoundError(f"no {sort} '{called}'{hint}{failed}")
 
     def everything(self) -> dict[str, Plugin]:
         """Return all stages and parts; those that fail to import are listed in ``broken``."""

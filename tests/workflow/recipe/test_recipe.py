@@ -1,6 +1,7 @@
 """Every mistake a recipe can hold, word for word."""
 
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -144,6 +145,15 @@ def test_a_good_recipe_resolves_to_itself(toy_registry: Registry) -> None:
             ["r.yaml:2: feature: no flange standard 'ISO 9409-1-50-5-M6'; known: "
              "ISO 9409-1-50-4-M6, ISO 9409-1-40-4-M6, ISO 9409-1-250-8-M12"],
         ),
+        ("title: T\nsteps: []", ["r.yaml:2: steps: is empty; at least one entry is needed"]),
+        (
+            STEPS.replace("- solve.toy", "- 1: 2\n  - verify.toy"),
+            ["r.yaml:6: steps.3: no stage '1'"],
+        ),
+        (
+            STEPS.replace("- solve.toy", '- "solve.x\\nerror: y"'),
+            [r"r.yaml:6: steps.3: no stage 'solve.x\nerror: y'; did you mean solve.toy?"],
+        ),
         (
             "seed: -1\n" + STEPS,
             ["r.yaml:1: seed: must be greater than or equal to 0, not '-1'"],
@@ -190,6 +200,35 @@ def test_an_override_changes_one_value(path: str, toy_registry: Registry, tmp_pa
     recipe = load_recipe(file, toy_registry, [f"{path}=0.2 mm", "seed=7"])
     assert recipe.steps[2].params.inlier == 0.0002
     assert recipe.header.seed == 7
+
+
+def test_a_recipe_that_is_no_file_is_named_as_what_it_is(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "loop.yaml").symlink_to("loop.yaml")
+    (tmp_path / "zero.yaml").symlink_to("/dev/zero")
+    for name, told in (
+        ("pipe.yaml", "is a device, a FIFO or a socket; a file is needed"),
+        ("zero.yaml", "is a device, a FIFO or a socket; a file is needed"),
+        ("loop.yaml", "cannot be read: Too many levels of symbolic links"),
+    ):
+        with pytest.raises(RecipeError) as refused:
+            find_recipe(str(tmp_path / name))
+        assert str(refused.value) == f"{tmp_path / name}: {told}"
+
+
+def test_the_home_of_an_unknown_user_is_one_line() -> None:
+    text = """title: T
+robot: {model: ur5}
+steps:
+  - acquire.archive: {path: ~nobody-here/session}
+  - segment.flange
+  - fit.rim
+  - solve.svd
+"""
+    assert mistakes(text, load_registry()) == [
+        "r.yaml:4: steps.0.acquire.archive.path: ~ and a name is the home folder of a user of "
+        "this machine, not '~nobody-here/session'"
+    ]
 
 
 def test_a_recipe_is_found_by_name_or_path(tmp_path: Path) -> None:

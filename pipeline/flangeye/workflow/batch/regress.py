@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from flangeye.errors import FlangeyeError, RecipeError
-from flangeye.files.paths import storage_at
+from flangeye.files.paths import at_home, storage_at
 from flangeye.models.model import Model, read_model
 from flangeye.units import Length
 from flangeye.workflow.batch import run_sessions
@@ -82,7 +82,10 @@ def compare(
 
 
 def _recording(file: Path, manifest: Manifest) -> Path:
-    return Path(os.path.normpath(file.parent / Path(manifest.recording).expanduser()))
+    try:
+        return Path(os.path.normpath(file.parent / at_home(manifest.recording)))
+    except ValueError as error:
+        raise RecipeError(f"{file}: recording: {error}, not '{manifest.recording}'") from None
 
 
 def _session(file: Path, manifest: Manifest, registry: Registry) -> BatchSession:

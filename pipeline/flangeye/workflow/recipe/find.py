@@ -1,10 +1,12 @@
 """Find a recipe by its path or its name."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from flangeye.errors import RecipeError
 from flangeye.files.paths import bundled
+from flangeye.files.regular import open_regular
 from flangeye.files.words import nearest
 
 
@@ -27,7 +29,9 @@ def find_recipe(name: str) -> Path:
         RecipeError: Neither exists; names the nearest bundled recipes.
     """
     path = Path(name)
-    if path.is_file():
+    if os.path.lexists(path) and not path.is_dir():
+        # Refuses a pipe, a device and a link to nothing, each with its own message
+        open_regular(path, RecipeError).close()
         return path
     known = recipe_names()
     if name in known:

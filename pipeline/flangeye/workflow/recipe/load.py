@@ -174,7 +174,9 @@ class _Checker:
         """Note one mistake at a path of keys."""
         overridden = any(tuple(keys[: len(path)]) == path for path in self._overridden)
         source = "--set " if overridden else f"{self._document.name}:{self._document.line(keys)}: "
-        self._mistakes.append(f"{source}{'.'.join(map(str, keys))}: {message}")
+        # A line break in a name must not look like a line of ours
+        place = ".".join(map(str, keys)).replace("\n", r"\n")
+        self._mistakes.append(f"{source}{place}: {message}")
 
     def _header(self, data: dict[Hashable, Any]) -> Header:
         """Return the sections without their mistakes, after reporting each."""

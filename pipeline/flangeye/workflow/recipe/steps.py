@@ -133,6 +133,7 @@ class StepOrder:
         """Check one step against the earlier ones; ``stage`` is None if it is not installed."""
         kind = name.partition(".")[0]
         if kind not in KINDS:
+            self.lose_track()
             return
         at = ("steps", index, name)
         self._check_place(at, kind)
@@ -238,7 +239,7 @@ def _required(needs: Iterable[Any]) -> list[Any]:
 
 
 def _a(noun: str) -> str:
-    return f"an {noun}" if noun[0] in "aeiou" else f"a {noun}"
+    return f"an {noun}" if noun[0] in "aeiouAEIO" else f"a {noun}"
 
 
 def _what_for(name: str) -> str:
@@ -256,4 +257,4 @@ def _missing(need: Any, purpose: str) -> str:
     givers = [kind for kind, contract in KINDS.items() if need in contract.opens]
     name = getattr(need, "__name__", str(need))
     cure = f"; put {_a(givers[0])} step before it" if givers else ""
-    return f"needs a {name}, which no earlier step gives{cure}"
+    return f"needs {_a(name)}, which no earlier step gives{cure}"
