@@ -246,27 +246,24 @@ def _is_identity(session: RecordedSession) -> Mask:
 
 @part("check.repeated")
 def repeated(session: RecordedSession) -> Findings:
-    """Find a pose or detection that was repeated although the arm had moved."""
+    """Find a pose or detection repeated although the arm had moved, and captures taken twice."""
     reported = [poses[:, :3].reshape(len(poses), 12) for _, poses in _reported(session)]
-    yield from _repeats(session, np.concatenate(reported, axis=1), session.centres, "robot pose")
+    poses = np.concatenate(reported, axis=1)
+    yield from _repeats(session, poses, session.centres, "robot pose")
     places = np.concatenate([poses[:, :3, 3] for _, poses in _reported(session)], axis=1)
     yield from _repeats(session, session.centres, places, "detection")
+    _, again = _alike(poses, session.centres)
+    if again.any():
+        told = f"{again.sum()} of {len(session)} captures were taken at the pose of an earlier one"
+        yield _left_out(session, again, "repeated capture", f"{told}, and show the same")
 
 
 def _repeats(
     session: RecordedSession, numbers: Floats, others: Floats, what: str
 ) -> Iterator[Finding]:
     """Find rows that repeat an earlier one to the last digit although the others moved on."""
-    from scipy.spatial import KDTree
-
-    read = np.flatnonzero(np.isfinite(numbers).all(axis=1))
-    alike = KDTree(numbers[read]).query_pairs(NOT_MEASURED_TWICE, p=np.inf, output_type="ndarray")
-    before, after = np.sort(read[alike], axis=1).T
-    # A target that has moved further was seen from another pose [m]
-    moved = np.linalg.norm(others[after] - others[before], axis=1) > 1e-3
-    wrong = np.zeros(len(numbers), dtype=bool)
     # Of two equal rows the later one is stale: the driver had nothing newer to return.
-    wrong[after[moved]] = True
+    wrong, _ = _alike(numbers, others)
     made_up = any(
         (np.abs(p[wrong] - np.eye(4)) < NOT_MEASURED_TWICE).all() for _, p in _reported(session)
     )
@@ -278,6 +275,21 @@ def _repeats(
             f"repeated {what}",
             f"{told}digit, although the arm had moved: they are stale",
         )
+
+
+def _alike(numbers: Floats, others: Floats) -> tuple[Mask, Mask]:
+    """Return the rows that repeat an earlier one to the last digit: others moved on, or did not."""
+    from scipy.spatial import KDTree
+
+    read = np.flatnonzero(np.isfinite(numbers).all(axis=1))
+    alike = KDTree(numbers[read]).query_pairs(NOT_MEASURED_TWICE, p=np.inf, output_type="ndarray")
+    before, after = np.sort(read[alike], axis=1).T
+    # A target that has moved further was seen from another pose [m]
+    moved = np.linalg.norm(others[after] - others[before], axis=1) > 1e-3
+    stale, again = np.zeros((2, len(numbers)), dtype=bool)
+    stale[after[moved]] = True
+    again[after[~moved]] = True
+    return stale, again & ~stale
 
 
 def _left_out(session: RecordedSession, wrong: NDArray[np.bool_], name: str, what: str) -> Finding:

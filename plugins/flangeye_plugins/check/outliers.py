@@ -42,8 +42,9 @@ def outlier(session: RecordedSession) -> Findings:
     if evidence.probability == 1:
         return
     name = session.ids[index]
-    distance = float(null.lengths[0, index, 0])
-    what = f"'{name}' is {distance * 1e3:.1f} mm off the calibration of all others"
+    distance, *turns = null.lengths[0, index].tolist()
+    turned = "".join(f" and {np.degrees(turn):.2g} deg" for turn in turns)
+    what = f"'{name}' is {distance * 1e3:.1f} mm{turned} off the calibration of all others"
     corrected_session = session.without(np.arange(len(session)) == index)
     yield evidence.finding("outlier", what, corrected_session, samples=(name,))
 

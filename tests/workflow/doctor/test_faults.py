@@ -369,6 +369,28 @@ def test_a_detection_that_is_stale() -> None:
     assert finding.name == "repeated detection"
 
 
+def test_a_capture_that_was_taken_twice() -> None:
+    session = session_of("marker")
+    poses, centres, rotations = map(np.array, (session.poses, session.centres, session.rotations))
+    poses[9], centres[9], rotations[9] = poses[8], centres[8] + 1e-5, rotations[8]
+    finding = only(replace(session.with_poses(poses), centres=centres, rotations=rotations))
+    assert finding.name == "repeated capture"
+    assert finding.samples == ("009",)
+    assert finding.what == (
+        "1 of 20 captures were taken at the pose of an earlier one, and show the same"
+    )
+    assert "leave_out: ['009']" in finding.fix
+
+
+def test_a_marker_seen_tilted_is_named_with_its_angle() -> None:
+    session = session_of("marker")
+    rotations = np.array(session.rotations)
+    rotations[7] = rotations[7] @ rotation_exp(np.radians([35.0, 0, 0]))
+    finding = only(replace(session, rotations=rotations))
+    assert finding.what.startswith("'007' is ")
+    assert finding.what.endswith(" mm and 35 deg off the calibration of all others")
+
+
 @pytest.mark.parametrize(("kind", "carried"), ALTERNATING)
 def test_a_target_that_moved_half_way(kind: Any, carried: Any) -> None:
     move = rigid(rotation_exp(np.array([0, 0.01, 0])), np.array([0.004, 0, 0]))
