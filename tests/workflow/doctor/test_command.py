@@ -1,5 +1,6 @@
 """``flangeye doctor`` as people call it: of a recipe, and with lines that can be copied."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.files.clouds import write_cloud
 from flangeye.files.yaml_lines import parse_value
+from flangeye.plugin.registry import load_registry
+from flangeye.types import CAMERA, PointCloud
 from flangeye.types.geometry import rigid, rotation_exp
 from flangeye.workflow.doctor.diagnosis import as_yaml
+from flangeye.workflow.doctor.opening import open_session
 
+SAMPLE = Path(__file__).parents[3] / "data" / "samples" / "ur5_phoxi-m"
 WORDS = [
     "null",
     "true",
@@ -91,6 +97,22 @@ def test_a_folder_that_no_reader_knows_leads_to_init(
         "error: rec: no reader knows this layout by itself, and no recipe states how it is read; "
         "write one: flangeye init rec; then: flangeye doctor recipe.yaml\n",
     )  # fmt: skip
+
+
+def test_a_log_keeps_captures_that_showed_nothing_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Callable[..., Any]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(SAMPLE, "session")
+    wall = np.stack(np.meshgrid(range(60), range(60)), axis=-1).reshape(-1, 2) * 0.01
+    points = np.column_stack([wall, np.full(3600, 0.8)])
+    write_cloud(tmp_path / "session" / "0003.pcd", PointCloud(CAMERA, points))
+    told = command("run", "ur5_phoxi-m_sample", "--archive", "session", "--out", "run")
+    assert told[0] == 0, told
+    # Of a session whose scans have the pose of the next, the order is all that tells
+    session = open_session(tmp_path / "run" / "run.mcap", load_registry())
+    assert session.ids == tuple(f"{i:04}" for i in range(8))
+    assert session.seen.tolist() == [i != 3 for i in range(8)]
 
 
 def test_what_the_run_set_aside_is_named_and_coarse_decimals_are_said(

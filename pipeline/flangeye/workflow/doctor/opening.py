@@ -170,8 +170,9 @@ def _of_log(path: Path, registry: Registry, recipe: Recipe | None) -> RecordedSe
     given = {o.id: o.base_T_flange.matrix for o in log.observations()}
     poses = {meta["id"]: np.array(meta["poses"][t.FLANGE]["matrix"]) for meta in calibration}
     times = {meta["id"]: int(meta["time_ns"]) for meta in calibration}
-    # Captures without a feature keep their poses: the checks of order need every moment
-    session = replace(_session({**given, **poses}, found, times), damage=tuple(log.notes))
+    # Captures without a feature keep their poses and places: the checks of order need every moment
+    every = poses | {name: pose for name, pose in given.items() if name not in poses}
+    session = replace(_session(every, found, times), damage=tuple(log.notes))
     states = {meta["id"]: _state_of(meta) for meta in calibration}
     if recipe is not None:
         session = replace(_as_recipe(session, recipe, states), again=_archive_again(recipe, found))
