@@ -189,6 +189,15 @@ def test_without_a_calibration_there_is_nothing_to_certify(tmp_path: Path) -> No
         write_certificate(tmp_path, None, Conditions())
 
 
+def test_a_damaged_log_is_not_certified(run: Path, tmp_path: Path) -> None:
+    raw = bytearray((run / "run.mcap").read_bytes())
+    raw[len(raw) // 4] ^= 1
+    (tmp_path / "run.mcap").write_bytes(raw)
+    with pytest.raises(StageError, match=r"run.mcap: damaged: .* checksum does not match"):
+        write_certificate(tmp_path, None, Conditions())
+    assert not (tmp_path / "certificate.html").exists()
+
+
 def test_the_browser_keeps_its_sandbox_but_for_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert sandbox() == []

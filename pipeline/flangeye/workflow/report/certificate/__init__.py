@@ -45,11 +45,13 @@ def write_certificate(
         camera: The certified camera, for a cell.
 
     Raises:
-        StageError: There is no log or no calibration in it, no camera of a cell was chosen, or the
-            file cannot be written.
+        StageError: There is no log, it is damaged or has no calibration, no camera of a cell was
+            chosen, or the file cannot be written.
     """
     log = run / "run.mcap" if run.is_dir() else run
-    facts = facts_of(read_run(log))
+    read = read_run(log)
+    read.require_sound()
+    facts = facts_of(read)
     facts = replace(facts, result=result_of_camera(facts.result, camera))
     page = render(facts, conditions)
     path = path or log.parent / f"certificate{f'-{camera}' if camera else ''}.html"
