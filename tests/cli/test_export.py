@@ -130,7 +130,7 @@ def test_a_recipe_exports_wherever_the_step_stands(exporting: Any, tmp_path: Pat
         (
             TOY_RECIPE,
             ("--to", "matrix", "--set", "name=../../x"),
-            "--set name: string should match pattern '^[A-Za-z][A-Za-z0-9_]{0,23}$', not '../../x'",
+            "--set name: must match the pattern '^[A-Za-z][A-Za-z0-9_]{0,23}$', not '../../x'",
         ),
     ],
 )

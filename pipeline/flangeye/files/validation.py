@@ -37,6 +37,7 @@ def sentence(details: Any, model: type[Any], given: Any) -> str:
     kinds |= {"bool": "true or false", "string": "a text"}
     message = str(details["msg"]).removeprefix("Value error, ")
     message = message.replace("Input should be", "must be")
+    message = message.replace("String should match pattern", "must match the pattern")
     if kind in kinds and details["type"].endswith(("_type", "_parsing", "_float")):
         message = f"must be {kinds[kind]}"
     if details["type"].startswith(("greater", "less")) and isinstance(given, str):

@@ -251,8 +251,10 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
     missed = found.index(None)
     told = f"{text.where(missed)}: its scan '{named[missed]}' does not exist"
     if more := found.count(None) - 1:
-        told += f", nor do {more} more of {len(found)}; put them there, or remove their rows"
-    raise StageError(told)
+        raise StageError(
+            f"{told}, nor do {more} more of {len(found)}; put them there, or remove their rows"
+        )
+    raise StageError(f"{told}; put it there, or remove the row")
 
 
 def _named(folder: Path, name: str) -> Path | None:

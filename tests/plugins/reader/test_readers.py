@@ -200,7 +200,7 @@ KUKA = TableParams(rotation="kuka", length="mm", angle="deg", pose="base_T_flang
     [
         ("s0.png,1,2,3,4,5\n", "poses.csv:1: kuka has 6 numbers (x y z a b c), not 5"),
         ("s0.png,1,2,x,4,5,6\n", "poses.csv:1: 'x' is not a number"),
-        ("no.png,1,2,3,4,5,6\n", "poses.csv:1: its scan 'no.png' does not exist"),
+        ("no.png,1,2,3,4,5,6\n", "poses.csv:1: its scan 'no.png' does not exist; put it there, or remove the row"),
         ("1,2,3,4,5,6\n", "poses.csv: has 1 poses, but the folder has 5 scans; name the scan of each "
          "pose in a column called scan, or remove the surplus"),
         ("s0.png,1,2,3,4,5,nan\n", "poses.csv:1: kuka: a number is not finite"),

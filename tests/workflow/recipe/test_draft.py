@@ -1,6 +1,7 @@
 """``flangeye init``: from folders as newcomers have them to a recipe that passes check, or a line."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -546,6 +547,13 @@ def arm_of_unknown_words(folder):
     table(folder, heading, lambda *pose: [*kuka(*pose), *quaternion(*pose)])
 
 
+def orientations_of_three(folder):
+    clouds(folder)
+    rows = [kuka(0, *pose) for pose in POSES]
+    told = [{"position_mm": row[:3], "orientation_zyx_deg": row[3:]} for row in rows]
+    (folder / "log.json").write_text(json.dumps(told))
+
+
 def tables_of_other_lengths(folder):
     for name in ("robot.csv", "marker.csv"):
         table(folder, "", quaternion, name=name)
@@ -645,6 +653,19 @@ def two_poses_of_nobody(folder):
          "rec/demo.bag: is a ROS 1 bag; convert it: pip install rosbags && rosbags-convert --src "
          "rec/demo.bag --dst rec/demo; then flangeye init rec again"),
         (meshes, [], "rec/scan_0.stl: is a mesh, not a scan; sample it to points as .ply: "),
+        (lambda folder: (folder / "scan_0.obj").write_text("v 1 2 3\n"), [],
+         "rec/scan_0.obj: is a mesh or a cloud that is not read; take its points: awk '$1 == "
+         "\"v\" {print $2, $3, $4}' rec/scan_0.obj > rec/scan_0.xyz; then flangeye init rec again"),
+        (lambda folder: (folder / "log.csv").write_text("1,2,3,4,5,6\n" * 900_000), [],
+         "rec/log.csv: is larger than 10 MB, so it was not looked into for poses; keep the rows "
+         "that belong to scans or markers, or state how it is read: --reader 'table: {file: …}'"),
+        (lambda folder: (folder / "poses\x1b[31m.csv").write_text("1,2,3,4,5,6\n"), [],
+         r"rec: the name of 'poses\x1b[31m.csv' has control characters or is not UTF-8, so no "
+         "recipe can name it; rename the file"),
+        (lambda folder: os.mkfifo(folder / "poses.csv"), [],
+         "rec: holds no files that can be read; put clouds or images there"),
+        (orientations_of_three, [], "not known: rotation convention of columns "
+         "orientation_zyx_deg.0, orientation_zyx_deg.1, orientation_zyx_deg.2 of log.json ("),
         (lambda folder: (folder / "s.zip").write_text("x"), [],
          "rec/s.zip: is an archive; unpack it: unzip rec/s.zip -d rec/s; then flangeye init rec"),
         (lambda folder: (folder / "scan.e57").write_text("x"), [],

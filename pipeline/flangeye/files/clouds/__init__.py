@@ -91,11 +91,13 @@ CONVERSIONS: Mapping[str, str] = {
             ((".e57",), "an E57 scan, which is not read; save it", ""),
             ((".las", ".laz"), "a LAS scan, which is not read; save it", ""),
             ((".off", ".vtk", ".ptx"), "a cloud or mesh that is not read; save it", ""),
-            ((".stl", ".obj"), "a mesh, not a scan; sample it to points",
+            ((".stl",), "a mesh, not a scan; sample it to points",
              "-SAMPLE_MESH POINTS 1000000 "),
         )
         for ending in endings
     },
+    ".obj": "is a mesh or a cloud that is not read; take its points: "
+    "awk '$1 == \"v\" {{print $2, $3, $4}}' {file} > {stem}.xyz",
     ".exr": "is a depth image that is not read; save it as .tiff or .npy",
     ".pfm": "is a depth image that is not read; save it as .tiff or .npy",
     ".gz": "is compressed; unpack all of them: gunzip *.gz",

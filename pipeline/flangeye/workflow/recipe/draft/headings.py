@@ -253,7 +253,8 @@ def _grouped(table: Table) -> tuple[dict[str, Group], Headings]:
             if time and rest.time is None:
                 rest = replace(rest, time=name, time_unit=unit)
             else:
-                plain = [each for each in words if each.lower() not in ("xyzw", "wxyz")]
+                orders = ("xyzw", "wxyz", "zyx", "zxy", "yxz", "yzx", "xzy", "zyz", "zxz")
+                plain = [each for each in words if each.lower() not in orders]
                 stated = len(plain) < len(words)
                 _put(groups, name, plain, listed=size == 4, ordered=stated or size != 4)
     # No arm has fewer than four joints, so j1 to j3 alone count something else
@@ -417,7 +418,8 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
         return PoseColumns(table, (*place, group.rotation), ("3x3",), *stated)
     if len(entries) == 9:
         return PoseColumns(table, (*place, *entries), ("3x3",), *stated)
-    fitting = [names for names in ROTATIONS if set(names) <= set(group.columns)]
+    turns = _turns(group)
+    fitting = [names for names in ROTATIONS if set(names) <= set(turns)]
     names = max(fitting, key=len, default=None)
     if names is None:
         return PoseColumns(table, place, ("point",), *stated)
@@ -425,7 +427,14 @@ def _pose(table: Table, group: Group) -> PoseColumns | None:
     # A list of four without letters: ROS and SciPy write w last, ABB and Eigen's constructor first
     if not group.ordered and names == ("qx", "qy", "qz", "qw"):
         known = ("quaternion_xyzw", "quaternion_wxyz")
-    return PoseColumns(table, (*place, *(group.columns[n] for n in names)), known, *stated)
+    return PoseColumns(table, (*place, *(turns[n] for n in names)), known, *stated)
+
+
+def _turns(group: Group) -> dict[str, Column]:
+    """Return a group's columns; an orientation of three numbers is angles, not a quaternion."""
+    angles = {name.replace("q", "r"): column for name, column in group.columns.items()
+              if name in ("qx", "qy", "qz")}  # fmt: skip
+    return group.columns if "qw" in group.columns else group.columns | angles
 
 
 def _matrix_entries(group: Group) -> tuple[Column, ...]:

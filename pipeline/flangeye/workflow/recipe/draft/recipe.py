@@ -31,7 +31,7 @@ from flangeye.plugin.stage import BoundPart
 from flangeye.types import FLANGE, Floats, Observation, PoseFeature
 from flangeye.workflow.recipe.draft.convention import measured, table_params
 from flangeye.workflow.recipe.draft.evidence import mounting_of, rotation_of
-from flangeye.workflow.recipe.draft.survey import FolderSurvey, Questions, one_of
+from flangeye.workflow.recipe.draft.survey import FolderSurvey, Questions, one_of, too_long
 from flangeye.workflow.recipe.load import parse_recipe
 
 PLATE = "ISO 9409-1-50-4-M6"
@@ -194,6 +194,13 @@ def _missing(survey: FolderSurvey, reason: StageError) -> str:
         return f"{survey.folder}: {closed[0].name} is a table that is not read; save it as .csv"
     some = 6  # names that a line shows
     named = [str(path.relative_to(survey.folder)) for path in survey.files]
+    if long := next((path for path in survey.files if too_long(path)), None):
+        return (
+            f"{long}: is larger than 10 MB, so it was not looked into for poses; keep the rows "
+            "that belong to scans or markers, or state how it is read: --reader 'table: {file: …}'"
+        )
+    if not named:
+        return f"{survey.folder}: holds no files that can be read; put clouds or images there"
     more = f" and {len(named) - some} more" if len(named) > some else ""
     return (
         f"{survey.folder}: no scans and no table of poses in {', '.join(named[:some])}{more}; "

@@ -16,6 +16,7 @@ from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import is_pointer
 from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES, is_matrix, natural, texts_of_points
 from flangeye.files.tables import DOCUMENT_READERS, Table, number_of, read_table, tables_in
+from flangeye.files.words import printable
 from flangeye.workflow.recipe.draft.headings import lists_in, role_in
 
 Prompt = Callable[[str, str | None], str]
@@ -175,6 +176,12 @@ def look(folder: Path) -> FolderSurvey:
     folder = _where_files_are(folder)
     found = (p for p in (*folder.glob("*"), *folder.glob("*/*")) if p.is_file())
     files = sorted(found, key=lambda path: natural(str(path)))
+    for path in files:
+        if printable(str(path)) != str(path):
+            raise RecipeError(
+                f"{folder}: the name of {path.name!a} has control characters or is not UTF-8, so "
+                "no recipe can name it; rename the file"
+            )
     if not any(folder.iterdir()):
         raise RecipeError(f"{folder}: is empty; put the clouds or images and their poses there")
     if pointers := [path for path in files if is_pointer(path)]:
@@ -224,8 +231,7 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
         *DOCUMENT_READERS,
     )  # fmt: skip
     for file in files:
-        # A file that is larger [bytes] holds scans, and is not looked into
-        if file.suffix.lower() in known and file.stat().st_size <= 10_000_000:
+        if file.suffix.lower() in known and not too_long(file):
             alike = re.sub(r"\d+", "*", file.stem) + file.suffix
             groups[str(file.relative_to(folder).with_name(alike))].append(file)
     groups = {place: of for files in groups.values() for place, of in _series(folder, files)}
@@ -237,6 +243,11 @@ def places(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path
             yield str(file.relative_to(folder)), [file]
     for name in one_each:  # a folder for each capture
         yield f"*/{name}", [file for file in single if file.name == name]
+
+
+def too_long(file: Path) -> bool:
+    """Return whether a file is too large to hold poses; it is not looked into."""
+    return file.stat().st_size > 10_000_000
 
 
 def _series(folder: Path, files: Sequence[Path]) -> Iterator[tuple[str, list[Path]]]:
