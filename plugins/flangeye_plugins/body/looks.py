@@ -216,17 +216,20 @@ class Looks(Shape):
 
     def twins(self, pose: Floats) -> Floats:
         """Return the pose after each rotation of a cube (K, 4, 4): they often look alike."""
-        middle = self.surface.points.mean(axis=0)
-        out = np.tile(np.eye(4), (len(QUARTERS), 1, 1))
-        out[:, :3, :3] = QUARTERS
-        out[:, :3, 3] = middle - QUARTERS @ middle
-        return np.asarray(pose @ out)
+        return self._turned(pose, QUARTERS)
 
     def reflections(self, pose: Floats) -> Floats:
         """Return left-handed poses (24, 4, 4) of the mirrored body in a cube's rotations."""
         flips = np.concatenate([np.eye(3)[None], QUARTERS]) @ np.diag([-1.0, 1.0, 1.0])
-        out = np.tile(np.eye(4), (len(flips), 1, 1))
-        out[:, :3, :3], out[:, :3, 3] = flips, self.centre - flips @ self.centre
+        return self._turned(pose, flips)
+
+    def _turned(self, pose: Floats, turns: Floats) -> Floats:
+        """Return the pose after each of the turns (K, 3, 3) about the surface's middle."""
+        # A small detail hardly moves it, unlike the centre of the bounding box
+        middle = self.surface.points.mean(axis=0)
+        out = np.tile(np.eye(4), (len(turns), 1, 1))
+        out[:, :3, :3] = turns
+        out[:, :3, 3] = middle - turns @ middle
         return np.asarray(pose @ out)
 
     def tolerance(self, view: CoarseImage) -> float:

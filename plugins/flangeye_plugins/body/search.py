@@ -39,6 +39,8 @@ class BodyVerdict(NamedTuple):
         ended: Rays beside the body that show something behind it.
         crossing: Rays beside the body that show something at the body's depth, beyond its end.
         outline: All rays beside the body.
+        upon: Rays of ``against`` and ``crossing`` that show something outside the body, before its
+            surface or above the plane of the face that ends there.
     """
 
     due: int
@@ -49,6 +51,7 @@ class BodyVerdict(NamedTuple):
     ended: int
     crossing: int
     outline: int
+    upon: int
 
     @property
     def bounded(self) -> bool:
@@ -69,8 +72,16 @@ class BodyVerdict(NamedTuple):
 
         Consistent rays meet its surface, or pass it and end behind it.
         """
+        return self._trusted(self.against + self.crossing)
+
+    @property
+    def trusted_but_for_touching(self) -> float:
+        """Return ``trusted`` without the rays that another thing on the body may explain."""
+        return self._trusted(self.against + self.crossing - self.upon)
+
+    def _trusted(self, contradicting: int) -> float:
         held = self.agree + self.ended
-        return held / max(held + self.against + self.crossing, 1)
+        return held / max(held + contradicting, 1)
 
     @property
     def rank(self) -> float:
@@ -110,11 +121,13 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     ended = depth[row, column][..., None] * rays[row, column]
     foot = shape.at_foot(((ended - pose[:3, 3]) @ pose[:3, :3]).reshape(-1, 3))
     beside &= ~foot.reshape(beside.shape)
-    on = np.abs(np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)) < 2 * tolerance
+    above = np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)
+    on = np.abs(above) < 2 * tolerance
     measured = beside & np.isfinite(scan[..., 2])
     ended_there = beside & (scan[..., 2] > depth[row, column] + 2 * tolerance)
     crossing = measured & ~ended_there & ~_hides(shape, scan, depth[row, column])
-    counts = (due, agree, against, beside & on, measured, ended_there, crossing, beside)
+    upon = (against & ~compared.through) | (crossing & (above > 2 * tolerance))
+    counts = (due, agree, against, beside & on, measured, ended_there, crossing, beside, upon)
     return BodyVerdict(*(int(count.sum()) for count in counts))
 
 
@@ -342,8 +355,7 @@ class BodySearch:
             (40, (0.06, 0.05), 0.03, 200 * effort),
             (160, (0.04, 0.03, 0.02), 0.02, 40 * effort),
         ):
-            for reach in reaches:
-                poses = self.looks.settled(poses, self._coarse, count, reach * self.looks.size)
+            poses = self._settled(poses, count, reaches)
             scores = self.looks.scores(poses, self._coarse, count, tolerance)
             poses = poses[distinct(poses, scores, self.looks, left)]
         found = self.near(poses)
@@ -351,8 +363,16 @@ class BodySearch:
             return []
         # Turned by a cube's rotations, the best may explain as much
         best = found[0]
-        turned = self.near(self.looks.twins(best.pose), best.rivalled_from)
+        twins = self._settled(self.looks.twins(best.pose))
+        turned = self.near(twins, best.rivalled_from)
         return self._distinct(found + turned)
+
+    def _settled(
+        self, poses: Floats, count: int = 160, reaches: tuple[float, ...] = (0.06, 0.04, 0.03)
+    ) -> Floats:
+        for reach in reaches:
+            poses = self.looks.settled(poses, self._coarse, count, reach * self.looks.size)
+        return poses
 
     def near(self, poses: Floats, least: float = 0.0) -> list[FoundPose]:
         """Return the best of the poses (K, 4, 4), refined on the scan's points, best first.
@@ -390,7 +410,8 @@ class BodySearch:
 
     def images(self, found: FoundPose) -> list[FoundPose]:
         """Return left-handed poses of the mirrored body that fit the scan nearly as well."""
-        return self.near(self.looks.reflections(found.pose), 0.9 * found.verdict.agree)
+        poses = self._settled(self.looks.reflections(found.pose))
+        return self.near(poses, 0.9 * found.verdict.agree)
 
     def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
         """Return the poses that no rival dominates: none explains their cells and a patch more."""

@@ -52,7 +52,13 @@ class SegmentBodyParams(Params):
 
     def passed_by(self, found: FoundPose) -> bool:
         """Return whether a candidate pose satisfies these parameters."""
-        return _passes(found, self.min_coverage, self.min_trust)
+        if _passes(found, self.min_coverage, self.min_trust):
+            return True
+        # Through a body at a wrong pose something is seen, or its surface goes on beyond its end.
+        # Another thing that touches it is seen outside it; the rest must then determine the pose
+        # better.
+        apart = found.verdict.trusted_but_for_touching >= self.min_trust
+        return apart and _passes(found, self.min_coverage, 0.9, goes_on=0.1, weakest=FIRM / 2)
 
 
 @stage("segment.body")
@@ -163,7 +169,7 @@ def _searched(
     if not found:
         for one in every:
             # A mirrored mesh may pass as narrowly as this one fails
-            if passes(one._replace(weakest=0.0)):
+            if _passes(one._replace(weakest=0.0), params.min_coverage, params.min_trust):
                 return _unsure(one, body)
         return (doubtful and _misdrawn(points, body, every, passes)) or _why_none(every, body)
     if doubtful:

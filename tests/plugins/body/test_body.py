@@ -37,7 +37,7 @@ from flangeye_emulators.world.mesh import MATERIALS, Mesh, box, flange_mesh, wri
 from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
-from flangeye_plugins.body.search import BodySearch, BodyVerdict
+from flangeye_plugins.body.search import BodySearch, BodyVerdict, FoundPose
 from flangeye_plugins.body.search import around as points_around
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
@@ -244,8 +244,32 @@ def test_a_body_that_is_not_there_is_refused() -> None:
 def test_a_body_is_bounded_unless_what_is_seen_beside_it_goes_on(
     beside: int, ended: int, crossing: int, bounded: bool
 ) -> None:
-    seen = BodyVerdict(300, 250, 0, 0, beside, ended, crossing, outline=100)
+    seen = BodyVerdict(300, 250, 0, 0, beside, ended, crossing, outline=100, upon=0)
     assert seen.bounded is bounded
+
+
+@pytest.mark.parametrize("seed", [73205, 73216])
+def test_a_thing_that_touches_the_body_does_not_refute_it(seed: int) -> None:
+    """A box that leans on the gripper's housing; another that its fingers stand on."""
+    told = trial("gripper", seed)
+    assert [np.linalg.norm(off(one, told.pose)[3:]) < 0.5e-3 for one in told.found] == [True]
+
+
+@pytest.mark.parametrize(
+    ("change", "weakest", "passes"),
+    [
+        ({}, 1e-3, True),
+        ({"upon": 60}, 1e-3, False),  # the others are seen through, or the surface goes on
+        ({"against": 120, "upon": 140}, 1e-3, False),  # a tenth of all rays
+        ({"goes_on": 20}, 1e-3, False),
+        ({}, 3e-3, False),  # as a chance fit may determine it
+    ],
+)
+def test_only_what_is_seen_outside_a_body_may_be_another_thing(
+    change: dict[str, int], weakest: float, passes: bool
+) -> None:
+    seen = BodyVerdict(1200, 1000, 60, 5, 120, 90, 20, outline=200, upon=80)
+    assert PASSES(FoundPose(POSE, seen._replace(**change), weakest, 0.3)) is passes
 
 
 @pytest.mark.parametrize(
@@ -500,6 +524,11 @@ def test_a_mirrored_mesh_that_a_half_turn_hides_is_refused_by_what_its_image_exp
     assert "drawn mirrored: its mirror image fits the scan better" in refused.reason
     assert "mirror the mesh" in refused.fix
     assert isinstance(found(capture, plate), FlangeCloud)
+
+
+def test_a_mirrored_meshs_image_is_found_where_a_detail_moves_its_centre() -> None:
+    """The gripper's gland, which stands out of the mirrored mesh's face, is no other thing."""
+    assert "its mirror image fits the scan better" in trial("gripper", 74021).why
 
 
 def test_of_two_poses_the_one_that_explains_a_patch_more_is_taken_alone() -> None:
