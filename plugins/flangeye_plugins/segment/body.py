@@ -28,8 +28,6 @@ from flangeye.types.geometry import invert, rigid
 from flangeye.units import Length, param
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from flangeye_plugins.body.looks import Looks
     from flangeye_plugins.body.search import BodySearch, FoundPose
 
@@ -171,7 +169,7 @@ def _searched(
             # A mirrored mesh may pass as narrowly as this one fails
             if _passes(one._replace(weakest=0.0), params.min_coverage, params.min_trust):
                 return _unsure(one, body)
-        return (doubtful and _misdrawn(points, body, every, passes)) or _why_none(every, body)
+        return (doubtful and _misdrawn(points, body, every, params)) or _why_none(every, body)
     if doubtful:
         images = [one for pose in found for one in search.images(pose) if passes(one)]
         if not (found := search.unrivalled(found, images)):
@@ -207,15 +205,16 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
 
 
 def _misdrawn(
-    points: Singles, body: TargetBody, every: list[FoundPose], passes: Callable[[FoundPose], bool]
+    points: Singles, body: TargetBody, every: list[FoundPose], params: SegmentBodyParams
 ) -> Rejected | None:
     """Return a rejection if a corrected version of the mesh is found instead; None if not."""
     from flangeye_plugins.body.looks import Looks, prepared
     from flangeye_plugins.body.search import FINE_ACROSS, BodySearch, contradicted_facets
     from flangeye_plugins.body.view import view_of
 
+    passes, trust = params.passed_by, params.min_trust
     for what, fix, other in _otherwise(body):
-        righted = filter(passes, BodySearch(points, prepared(other), passes).quickly())
+        righted = filter(passes, BodySearch(points, prepared(other), passes).quickly(trust))
         if found := next(righted, None):
             return Rejected(
                 f"{body.name} is {what}: with a corrected mesh it would be found",
@@ -226,12 +225,14 @@ def _misdrawn(
     vertices, facets = shape.facets
     # Parts that stand elsewhere hide some of the rest, and a rest is found in clutter sooner.
     holds = partial(_passes, coverage=0.0, trust=0.93, goes_on=0.1, weakest=FIRM / 2)
+    rests = dict[bytes, BodySearch]()
     view, held = view_of(points, shape.size / FINE_ACROSS), list[tuple[float, Floats]]()
     for pose in (one.pose for one in every):
         gone = contradicted_facets(shape, view, pose)
         if gone is not None:
             rest = Looks(vertices, facets[~gone].astype(np.int32), mounted=True)
-            near = filter(holds, BodySearch(points, rest, holds).near(pose[None]))
+            search = rests.setdefault(gone.tobytes(), BodySearch(points, rest, holds))
+            near = filter(holds, search.near(pose[None], trust=0.93))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:
         return None
