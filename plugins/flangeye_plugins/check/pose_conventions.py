@@ -353,12 +353,21 @@ def _choices(
 
 
 def _read_so(session: RecordedSession, reading: Reading) -> tuple[str, RecordedSession]:
-    """Return the recipe line for a reading, and the session read with it."""
-    if reading.remounted:
-        name = "eye-on-base" if session.carried == "camera" else "eye-in-hand"
-        held: Literal["camera", "target"] = "target" if name == "eye-on-base" else "camera"
-        line = f"configuration: {{name: {name}, place: unknown}}"
+    """Return the recipe's lines for a reading, and the session read with it."""
+    if not reading.remounted:
+        mended = _rewritten(session, reading)
+        return mended.step(), mended
+    name = "eye-on-base" if session.carried == "camera" else "eye-in-hand"
+    held: Literal["camera", "target"] = "target" if name == "eye-on-base" else "camera"
+    line = f"configuration: {{name: {name}, place: unknown}}"
+    if not (reading.exchanged or reading.robot_inverted or reading.marker_inverted):
         return line, replace(session, carried=held)
+    mended = replace(_rewritten(session, reading), carried=held)
+    return f"{mended.step()}\n  {line}", mended
+
+
+def _rewritten(session: RecordedSession, reading: Reading) -> RecordedSession:
+    """Return the session whose poses are read so, with the camera where it was."""
     shown = session.where(np.asarray(np.isfinite(session.rotations).all(axis=(1, 2))))
     session = shown if reading.exchanged or reading.marker_inverted else session
     told: dict[str, Any] = {"exchanged": True} if reading.exchanged else {}
@@ -366,9 +375,7 @@ def _read_so(session: RecordedSession, reading: Reading) -> tuple[str, RecordedS
     told |= {"target": {"inverted": True}} if reading.marker_inverted else {}
     read = replace(session.read_with(**told), motions=None)
     if session is not shown:
-        mended = replace(read, poses=inverted(session.poses))
-    else:
-        pairs = reading.of(pairs_of(session))
-        turns, centres = pairs.marker[:, :3, :3], pairs.marker[:, :3, 3]
-        mended = replace(read, poses=pairs.robot, rotations=turns, centres=centres)
-    return mended.step(), mended
+        return replace(read, poses=inverted(session.poses))
+    pairs = reading.of(pairs_of(session))
+    turns, centres = pairs.marker[:, :3, :3], pairs.marker[:, :3, 3]
+    return replace(read, poses=pairs.robot, rotations=turns, centres=centres)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
+from flangeye.estimation.readings import Reading
 from flangeye.maths.pose_corrections import (
     delayed,
     inverted,
@@ -19,9 +20,11 @@ from flangeye.maths.pose_corrections import (
 )
 from flangeye.maths.streams import later, passed, pose_at
 from flangeye.types.geometry import rigid, rotation_exp
-from flangeye.workflow.doctor import combined_fix
-from flangeye.workflow.doctor.diagnosis import Finding, RecordedSession, examine
+from flangeye.workflow.doctor import combined_fix, fix_lines
+from flangeye.workflow.doctor.diagnosis import OR_ELSE, Finding, RecordedSession, examine
 from flangeye_plugins.check import CHECKS
+from flangeye_plugins.check.fitting import fit_of
+from flangeye_plugins.check.pose_conventions import _read_so
 from tests.crossing import crossed
 from tests.workflow.doctor.sessions import CARRIED, KINDS, bent, clean, in_motion
 
@@ -367,6 +370,31 @@ def test_a_detection_that_is_stale() -> None:
     centres[5], rotations[5] = centres[4], rotations[4]
     finding = only(replace(session, centres=centres, rotations=rotations))
     assert finding.name == "repeated detection"
+
+
+def test_a_reading_of_poses_and_mounting_names_both_lines() -> None:
+    session = session_of("marker", "camera")
+    wrong = replace(session.with_poses(np.linalg.inv(session.poses)), carried="target")
+    lines, mended = _read_so(wrong, Reading(robot_inverted=True, remounted=True))
+    step, mounting = lines.split("\n  ")
+    assert "robot: {inverted: true}" in step
+    assert mounting == "configuration: {name: eye-in-hand, place: unknown}"
+    alone = replace(wrong, carried="camera")  # the second line without the first
+    assert fit_of(alone).misfit().position > 0.05
+    assert fit_of(mended).misfit().position < 0.5e-3
+    finding = Finding("mounting", "x", f"{step}{OR_ELSE}{lines}")
+    assert [set(choice) for choice in finding.lines] == [
+        {"acquire.archive"},
+        {"acquire.archive", "configuration"},
+    ]
+    assert fix_lines(finding, "") == [f"fix: {step}", f"or:  {step}\n     {mounting}"]
+
+
+def test_of_choices_the_first_is_what_later_lines_go_with() -> None:
+    first = Finding("a", "one", f"- acquire.samples: {{path: a}}{OR_ELSE}- acquire.samples: {{}}")
+    then = Finding("b", "two", "configuration: {name: eye-in-hand}")
+    _, _, steps = combined_fix([first, then])
+    assert steps == ["- acquire.samples: {path: a}\n  configuration: {name: eye-in-hand}"]
 
 
 def test_a_capture_that_was_taken_twice() -> None:

@@ -66,10 +66,13 @@ def combined_fix(findings: Sequence[Finding]) -> tuple[str, str, list[str]]:
     corrects them all. A first mistake without such a line is reported alone.
     """
     together = list(takewhile(lambda finding: finding.lines, findings)) or [findings[0]]
-    lines = {finding.fix.split(": ")[0]: finding.fix for finding in together}
+    # Later mistakes were found with the first choice of the earlier ones made
+    made = [line for finding in together for line in finding.choices[0].split("\n  ")]
+    lines = {line.split(": ")[0]: line for line in made}
     wrong = "; and ".join(finding.what for finding in together)
     known = "; then ".join(filter(None, map(evidence_of, together)))
-    steps = ["\n  ".join(sorted(lines.values()))] if len(lines) > 1 else together[-1].choices
+    several = len(together) > 1 and len(lines) > 1
+    steps = ["\n  ".join(sorted(lines.values()))] if several else together[-1].choices
     if known:
         known = f"re-solved with the correction: {known}"
     elif together[0].samples:
@@ -81,7 +84,7 @@ def fix_lines(finding: Finding, indent: str) -> list[str]:
     """Return the fixes, one line for each choice; empty if there is none."""
     if not finding.fix:
         return []
-    first, *others = finding.choices
+    first, *others = (choice.replace("\n", f"\n{indent}   ") for choice in finding.choices)
     return [f"{indent}fix: {first}", *(f"{indent}or:  {other}" for other in others)]
 
 

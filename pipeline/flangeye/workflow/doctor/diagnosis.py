@@ -267,16 +267,21 @@ class Finding:
 
     @property
     def lines(self) -> list[dict[str, Any]]:
-        """The lines of a recipe to choose from, a step or section each, by its name.
+        """The lines of a recipe to choose from, steps and sections by their names.
 
         Empty where a person has something to do that is not a line.
         """
-        lines = [
-            choice.removeprefix("- ")
-            for choice in self.choices
-            if re.fullmatch(r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}(  # .*)?", choice)
+        form = r"(- [a-z]+\.\w+|[a-z_]+): \{.*\}(  # .*)?"
+        choices = [choice.split("\n  ") for choice in self.choices]
+        return [
+            {
+                name: value
+                for line in choice
+                for name, value in parse_value(line.removeprefix("- "), "the doctor's line").items()
+            }
+            for choice in choices
+            if all(re.fullmatch(form, line) for line in choice)
         ]
-        return [dict(parse_value(line, "the doctor's line")) for line in lines]
 
 
 Findings = Iterable[Finding]
