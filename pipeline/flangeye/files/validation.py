@@ -44,6 +44,8 @@ def sentence(details: Any, model: type[Any], given: Any) -> str:
         message += " in SI units"
     if isinstance(given, (str, int, float)) and str(given) not in message:
         message += f", not '{given}'"
+    if kind == "string" and isinstance(given, (int, float)):
+        message += "; write it in quotes"
     return message[0].lower() + message[1:]
 
 

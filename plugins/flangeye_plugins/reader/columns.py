@@ -101,6 +101,14 @@ class ColumnsParams(TimesParams, WrittenParams):
     """Names of the columns, or numbers from 1, in the convention's order, position first. In JSON
     and YAML also the name of a list. By default all columns that no other parameter names."""
 
+    @field_validator("columns")
+    @classmethod
+    def _each_once(cls, value: tuple[Column, ...]) -> tuple[Column, ...]:
+        twice = next((column for column in value if value.count(column) > 1), None)
+        if twice is not None:
+            raise ValueError(f"names the column {twice} twice; each number of a pose has its own")
+        return value
+
 
 class FlangePoseParams(ColumnsParams):
     """Columns of an arm's flange pose, as its controller reports it."""

@@ -50,6 +50,11 @@ def params(**more):
     )
 
 
+def test_a_column_is_named_once() -> None:
+    with pytest.raises(ValidationError, match="names the column x twice; each number of a pose"):
+        params(columns=["x", "x", "z", "qx", "qy", "qz", "qw"])
+
+
 @pytest.mark.parametrize(
     ("mark", "decimal", "name"),
     [(",", ".", "a.csv"), (";", ",", "a.dat"), ("\t", ",", "a.txt"), (" ", ",", "a.log"),

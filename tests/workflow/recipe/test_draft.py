@@ -600,6 +600,14 @@ def arrays_of_the_arm(folder):
     np.save(folder / "robot.npy", ARM)
 
 
+def two_markers_for_each_pose(folder):
+    table(folder, "x,y,z,qx,qy,qz,qw", quaternion, "robot.csv")
+    heading = "frame,id,x,y,z,qx,qy,qz,qw"
+    rows = [f"{k},{tag},{','.join(map(str, quaternion(k, *pose)))}"
+            for k, pose in enumerate(POSES) for tag in (3, 5)]  # fmt: skip
+    (folder / "marker.csv").write_text("\n".join([heading, *rows]))
+
+
 def two_tables_of_nobody(folder):
     for name in ("a.csv", "b.csv"):
         table(folder, "x,y,z,qx,qy,qz,qw", quaternion, name)
@@ -676,6 +684,8 @@ def two_poses_of_nobody(folder):
         (arm_of_unknown_words, [], "rec/log.csv: has what the camera measured, but no poses of the arm; put its poses or joint angles beside it as .csv, a row each, or add --columns NAMES"),
         (tables_of_other_lengths, [], "rec/marker.csv: has 4 rows, robot.csv has 5; give each "
          "a column time to join them by it, or remove the surplus"),
+        (two_markers_for_each_pose, [], "rec/marker.csv: has 10 rows, robot.csv has 5; give each "
+         "a column time to join them by it, or remove the surplus, such as all but one of the 2 for each pose"),
         (two_tables_of_nobody, [], "not known: which poses are the arm's (a.csv, b.csv); add "
          "--table a.csv"),
         (two_poses_of_nobody, [], "not known: which poses are the arm's (log.csv:a, log.csv:b); "

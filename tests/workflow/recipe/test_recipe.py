@@ -145,6 +145,10 @@ def test_a_good_recipe_resolves_to_itself(toy_registry: Registry) -> None:
             ["r.yaml:2: feature: no flange standard 'ISO 9409-1-50-5-M6'; known: "
              "ISO 9409-1-50-4-M6, ISO 9409-1-40-4-M6, ISO 9409-1-250-8-M12"],
         ),
+        (
+            STEPS.replace("title: T", "title: 12"),
+            ["r.yaml:1: title: must be a text, not '12'; write it in quotes"],
+        ),
         ("title: T\nsteps: []", ["r.yaml:2: steps: is empty; at least one entry is needed"]),
         (
             STEPS.replace("- solve.toy", "- 1: 2\n  - verify.toy"),

@@ -155,9 +155,13 @@ def rows_together(
         order, note = partners(str(table.file), stems, other_stems, f"rows of {other.name}")
         return list(order), [note]
     if len(other.rows) != len(table.rows):
+        each, left = divmod(len(other.rows), max(len(table.rows), 1))
+        of_others = (
+            f", such as all but one of the {each} for each pose" if each and not left else ""
+        )
         raise StageError(
             f"{other.file}: has {len(other.rows)} rows, {table.name} has {len(table.rows)}; "
-            "give each a column time to join them by it, or remove the surplus"
+            f"give each a column time to join them by it, or remove the surplus{of_others}"
         )
     return list(range(len(table.rows))), [f"paired row by row: {table.name} with {other.name}"]
 
