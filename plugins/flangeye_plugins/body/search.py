@@ -55,11 +55,11 @@ class BodyVerdict(NamedTuple):
 
     @property
     def bounded(self) -> bool:
-        """Whether the body's outline is seen, or nothing is seen around it but what hides it."""
+        """Whether the body's outline is seen, or nothing is seen around it."""
         # Smallest share of the outline that must end before something farther: otherwise a plate
         # would fit any face of a box
         least = 0.03 * self.outline
-        return self.outline > 0 and (self.ended >= least or self.ended + self.crossing < least)
+        return self.outline > 0 and (self.ended >= least or self.beside < least)
 
     @property
     def shown(self) -> float:
@@ -363,8 +363,7 @@ class BodySearch:
             return []
         # Turned by a cube's rotations, the best may explain as much
         best = found[0]
-        twins = self._settled(self.looks.twins(best.pose))
-        turned = self.near(twins, best.rivalled_from, trust)
+        turned = self.near(self.looks.twins(best.pose), best.rivalled_from, trust)
         return self._distinct(found + turned)
 
     def _settled(

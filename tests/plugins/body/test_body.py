@@ -236,12 +236,12 @@ def test_a_body_that_is_not_there_is_refused() -> None:
     ("beside", "ended", "crossing", "bounded"),
     [
         (0, 0, 0, True),  # nothing was measured around it
-        (60, 0, 0, True),  # all that was measured there hides what is behind
+        (60, 0, 0, False),  # all that was measured there hides where it ends
         (60, 30, 20, True),  # the body ends before something farther
         (60, 2, 50, False),  # what is there goes on, as on the face of a box
     ],
 )
-def test_a_body_is_bounded_unless_what_is_seen_beside_it_goes_on(
+def test_a_body_is_bounded_where_it_is_seen_to_end(
     beside: int, ended: int, crossing: int, bounded: bool
 ) -> None:
     seen = BodyVerdict(300, 250, 0, 0, beside, ended, crossing, outline=100, upon=0)
