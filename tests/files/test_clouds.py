@@ -1,5 +1,6 @@
 """Point cloud files: every encoding round trips, every defect has its one line."""
 
+import subprocess
 import time
 import tracemalloc
 from pathlib import Path
@@ -596,10 +597,21 @@ def test_a_viewpoint_is_said_and_applied_on_request(tmp_path: Path) -> None:
         read_cloud(path)
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".stl", ".las", ".e57"])
+@pytest.mark.parametrize("suffix", [".stl", ".las", ".e57"])
 def test_other_kinds_are_named_with_their_conversion(tmp_path: Path, suffix: str) -> None:
     with pytest.raises(StageError, match=f"save it as .ply|as .ply: CloudCompare -O .*a{suffix}"):
         read_cloud(tmp_path / f"a{suffix}")
+
+
+def test_the_command_that_takes_the_points_of_an_obj_runs_as_it_is_printed(tmp_path: Path) -> None:
+    path = tmp_path / "a; touch b 'c'.obj"
+    path.write_text("# points\nv 1 2 3\nvn 0 0 1\nv 4 5 6\nf 1 2 1\n")
+    with pytest.raises(StageError, match="take its points: awk ") as refused:
+        read_cloud(path)
+    command = str(refused.value).split("take its points: ")[1]
+    subprocess.run(["sh", "-c", command], check=True, cwd=tmp_path)
+    assert read_cloud(path.with_suffix(".xyz")).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert {each.name for each in tmp_path.iterdir()} == {path.name, "a; touch b 'c'.xyz"}
 
 
 def test_a_makers_own_kind_is_named_with_what_exports_it(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ points is valid.
 """
 
 import math
+import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal
@@ -180,7 +181,9 @@ def write_cloud(path: Path, cloud: PointCloud, unit: LengthUnit = "m") -> None:
 def _open(path: Path) -> PointTable:
     opener, other = CLOUD_FILES.get(path.suffix.lower()), CONVERSIONS.get(path.suffix.lower())
     if other is not None:
-        refuse(path, other.format(file=path, stem=path.with_suffix("")))
+        # The command is there to be pasted into a shell
+        file, stem = (shlex.quote(str(each)) for each in (path, path.with_suffix("")))
+        refuse(path, other.format(file=file, stem=stem))
     if opener is None:
         refuse(path, f"'{path.suffix}' is not a point cloud; known: {', '.join(CLOUD_FILES)}")
     table = opener(path)
