@@ -1,7 +1,7 @@
 """Sessions of arms by a generator that shares no code with the project: NumPy and SciPy alone.
 
-Arms by the makers' Denavit-Hartenberg tables, with joint zeros, lengths, twists, encoders once and
-twice a turn, sag, backlash and a drift over the session, the last three of which no effect of the
+Arms by the makers' Denavit-Hartenberg tables, with joint zeros, lengths, twists, backlash, encoders
+once and twice a turn, sag and a drift over the session, the last three of which no effect of the
 estimator describes as they are made here.
 """
 

@@ -154,15 +154,15 @@ def test_the_error_to_expect_is_that_of_the_answer_and_of_what_changes_anew() ->
     rng = np.random.default_rng(0)
     rows, x = rng.standard_normal((40, 3, 5)), rng.standard_normal(5)
     means = np.array([rows @ x, rows @ x + 1.0])
-    squares, chances = np.array([0.5, 0.25]), np.array([0.3, 0.1])
-    there = PredictedWork(rows, chances, means, rng.standard_normal((2, 8, 40, 3)), squares)
+    squares = np.array([0.5, 0.25])
+    there = PredictedWork(rows, means, rng.standard_normal((2, 8, 40, 3)), squares)
     # Of places and effects as they are, what is left is the second's own and what changes anew
     told = expected_error(there, x[:3], x[3:])
-    assert told.rms == pytest.approx(np.sqrt((0.3 * 0.5 + 0.1 * 3.25) / 0.4))
+    assert told.rms == pytest.approx(np.sqrt((0.5 + 3.25) / 2))
     of_arm = ((rows[..., 3:] @ x[3:]) ** 2).sum(axis=1).mean()
     also = ((rows[..., 3:] @ x[3:] + 1.0) ** 2).sum(axis=1).mean()
     told = expected_error(there, x[:3])
-    assert told.rms == pytest.approx(np.sqrt((0.3 * (of_arm + 0.5) + 0.1 * (also + 0.25)) / 0.4))
+    assert told.rms == pytest.approx(np.sqrt((of_arm + 0.5 + also + 0.25) / 2))
 
 
 def test_of_twenty_errors_one_is_larger_than_its_quantile_whatever_the_scale_of_the_draws() -> None:
@@ -171,18 +171,10 @@ def test_of_twenty_errors_one_is_larger_than_its_quantile_whatever_the_scale_of_
     drawn[..., 2] = np.arange(800.0).reshape(8, 100) + 1.0
     exact = (np.arange(1.0, 801.0) ** 2).mean()
     for scale in (1.0, 7.0):
-        there = PredictedWork(
-            rows, np.ones(1), np.zeros((1, 100, 3)), scale * drawn, np.array([exact])
-        )
+        there = PredictedWork(rows, np.zeros((1, 100, 3)), scale * drawn, np.array([exact]))
         told = expected_error(there, none)
         assert told.p95 == pytest.approx(760.0, abs=1.01)
         assert told.rms == pytest.approx(np.sqrt(exact))
-    # A component that is hardly likely hardly counts
-    far = PredictedWork(
-        rows, np.array([0.97, 0.03]), np.zeros((2, 100, 3)), np.concatenate([drawn, 100 * drawn]),
-        np.array([exact, 1e4 * exact]),
-    )  # fmt: skip
-    assert expected_error(far, none).p95 == pytest.approx(800 * 0.95 / 0.97, abs=2.0)
 
 
 def displaced(found: Estimate, numbers: Floats) -> Floats:

@@ -101,13 +101,13 @@ def test_wrong_poses_are_set_aside_and_named(name: str, feature: str, share: flo
 
 @pytest.mark.parametrize(("name", "feature"), SOME)
 def test_the_stated_regions_hold_the_truth(name: str, feature: str) -> None:
-    """Of five sessions of each kind nearly all; no wider, for their mean is near the numbers'."""
+    """Of four sessions of each kind nearly all; hardly wider, though these arms err in nothing."""
     found = []
     for seed in range(4):
         made = session(CONFIGURATIONS[name], np.random.default_rng(seed), n=20, feature=feature)
         found += squares(solved(made), made.truth)
     assert max(found) < 2 * OF_MOST
-    assert 0.5 < np.mean(found) < 11
+    assert 0.4 < np.mean(found) < 11  # of six numbers; what arms may do wrong is counted
 
 
 @pytest.mark.slow

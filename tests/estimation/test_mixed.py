@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flangeye.estimation.mixed import Draws, Posterior, fit, left_out, mode_of, shares
+from flangeye.estimation.mixed import Posterior, fit, left_out, mode_of, shares
 from tests.estimation import foreign
 from tests.estimation.sessions import estimated, robot, score
 
@@ -87,7 +87,7 @@ def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -
     shares[fold] = 0.0
     others = posterior.model.weighted(shares)
     assert posterior.without(fold).model.shares.tolist() == shares.tolist()
-    for known, left in zip(posterior.draws.fits, posterior.without(fold).draws.fits, strict=True):
+    for known, left in zip(posterior.fits, posterior.without(fold).fits, strict=True):
         again = fit(others, known.sizes)
         assert left.mean == pytest.approx(again.mean, rel=1e-6, abs=1e-12)
         assert left.covariance == pytest.approx(again.covariance, rel=1e-6, abs=1e-15)
@@ -96,7 +96,7 @@ def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -
 def test_shares_are_what_each_cause_does_to_the_answer(found) -> None:
     known, mode = found.posterior, found.posterior.mode
     model, (n, _, count) = known.model, known.model.design.shape
-    one = Posterior(model, mode, lambda: Draws((mode,), np.ones(1)), 0.0)
+    one = Posterior(model, mode, lambda: [mode], 0.0)
     of_effects, noise = shares(one, np.eye(count)[: model.p])
     gain = (mode.covariance @ (model.weights(mode.sizes) @ model.design).reshape(6 * n, count).T)[
         : model.p
@@ -109,6 +109,14 @@ def test_shares_are_what_each_cause_does_to_the_answer(found) -> None:
     each = gain.reshape(model.p, n, 6).swapaxes(0, 1)
     whole = (each @ model.noise(mode.sizes) @ each.swapaxes(1, 2)).sum(axis=0)
     assert noise == pytest.approx(whole, rel=1e-4, abs=1e-6 * whole.max())
+
+
+def test_where_a_draw_has_more_noise_of_one_kind_it_has_less_of_another(found) -> None:
+    """Sightings tell how large all noise is, but not which: draws differ in this alone."""
+    model, own = found.posterior.model, np.unique(found.posterior.model.factors)
+    sizes = np.array([each.sizes for each in found.posterior.fits])
+    whole = [np.linalg.slogdet(model.noise(each))[1].mean() / 12 for each in sizes]
+    assert np.std(whole) < 0.1 and np.std(np.log(sizes[:, own]), axis=0).max() > 1.0
 
 
 def test_a_pose_that_belongs_elsewhere_is_set_aside() -> None:

@@ -251,14 +251,12 @@ class PredictedWork:
 
     Attributes:
         rows: (W, 3, P + K) derivatives of the predicted positions by places and effects [m].
-        chances: (F,) weights of the components; they sum to one.
         means: (F, W, 3) expected errors [m].
         drawn: (F, 8, W, 3) errors drawn about the means [m].
         squares: (F,) the exact mean square of the errors [m^2].
     """
 
     rows: Floats
-    chances: Floats
     means: Floats
     drawn: Floats
     squares: Floats
@@ -275,7 +273,7 @@ def predicted_work(found: Estimate, work: Work) -> PredictedWork:
     rows = model.design[:, 3:]
     moved = np.flatnonzero(rows.any(axis=(0, 1)))
     lasting, drawn, squares = rows[:, :, moved], [], []
-    for each in known.draws.fits:
+    for each in known.fits:
         noise = model.noise(each.sizes)[:, 3:, 3:]
         covariance = spread_of(lasting, each.covariance[np.ix_(moved, moved)]) + noise
         # A nanometre keeps the root real where a prediction has no error along an axis
@@ -283,8 +281,8 @@ def predicted_work(found: Estimate, work: Work) -> PredictedWork:
         # Eight of an error at each pose and each draw of the sizes, for its quantiles
         drawn.append((root @ rng.standard_normal((8, len(rows), 3, 1)))[..., 0])
         squares.append(np.trace(covariance, axis1=1, axis2=2).mean())
-    means = np.array([rows @ each.mean for each in known.draws.fits])
-    return PredictedWork(rows, known.draws.chances, means, np.array(drawn), np.array(squares))
+    means = np.array([rows @ each.mean for each in known.fits])
+    return PredictedWork(rows, means, np.array(drawn), np.array(squares))
 
 
 def expected_error(
@@ -303,8 +301,5 @@ def expected_error(
     values = ((bias[:, None] + there.drawn) ** 2).sum(axis=3).reshape(len(exact), -1)
     # The draws are for the quantile alone; scaled so that their mean is the exact mean square
     values *= (exact / values.mean(axis=1))[:, None]
-    weights = np.broadcast_to(there.chances[:, None], values.shape)
-    order = np.argsort(values, axis=None)
-    share = np.cumsum(weights.flat[order]) / weights.sum()
-    p95 = float(np.sqrt(values.flat[order[np.searchsorted(share, 0.95)]]))
-    return ExpectedError(float(np.sqrt(there.chances @ exact / there.chances.sum())), p95)
+    p95 = float(np.sqrt(np.quantile(values, 0.95)))
+    return ExpectedError(float(np.sqrt(exact.mean())), p95)

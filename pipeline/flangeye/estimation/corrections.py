@@ -82,7 +82,8 @@ def _as_field(found: Estimate, carrier: Carrier) -> Floats:
     linear, rest = problem.following(carrier), np.zeros((len(problem.seen), 3))
     ends = np.cumsum([found.posterior.model.p, *found.counts])
     for effect, first, end in zip(found.effects, ends, ends[1:], strict=False):
-        if effect.cause == carrier.arm and effect.kind not in {*CORRECTED, COMMON}:
+        mine = effect.of_arm and effect.cause == carrier.arm
+        if mine and effect.kind not in {*CORRECTED, COMMON}:
             rest += effect.block(problem, linear)[:, 3:] @ found.posterior.mean[first:end]
     places = _places(found, carrier)[problem.seen.times]
     # The rigid part is in the camera's pose already: left in here it would be corrected twice

@@ -106,7 +106,7 @@ def prior_of(
         # Median noise of a sighting beyond what its feature's fit states, rotation [rad]
         # and translation [m]; it may be four times more or less, one sigma
         *((size, 4.0, "") for size in (0.05e-3, 0.02e-3)),
-        *((s.size, s.factor, s.cause) for s in scatters),
+        *((s.size, s.factor, "") for s in scatters),
     ]
     causes = sorted({cause for _, _, cause in sized if cause})
     mix = np.zeros((len(sized), len(sized) + len(causes)))

@@ -9,8 +9,8 @@ where p moves the unknown places and each effect E_k is a possible error of the 
 = D C D + sum_m t_m^2 T_m: the features' own covariances C, scaled by D for turns and for shifts,
 along the line of sight and across it, and other noise T_m that varies from sighting to sighting.
 Sizes s_k, D and t_m maximise the restricted likelihood (REML, Patterson & Thompson 1971) times
-their priors, and are then integrated over by importance sampling about that mode, for a dozen
-sightings do not determine them. Henderson's mixed-model equations give p and delta at every set of
+their priors. A dozen sightings do not determine them, so they are drawn about that mode (Laplace's
+approximation). Henderson's mixed-model equations give p and delta at every set of
 sizes by one Cholesky factorisation of as many unknowns as places and effects have: the cost is
 linear in N. Arrays only.
 """
@@ -256,7 +256,7 @@ def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Flo
     slope = back @ (np.eye(6) - spread) @ known.whitening
     amounts = sizes[model.factors].prod(axis=1)
     by_cause = amounts * (model.causes.reshape(len(amounts), -1) @ slope.ravel())
-    powers = (model.factors[..., None] == np.arange(count)).sum(axis=1)
+    powers = _powers(model)
     gradient += powers.T @ by_cause
     curvature += (powers.T * by_cause) @ powers / 2
     # V_i P y in units of the noise, for each size
@@ -274,68 +274,53 @@ def spread_of(rows: Floats, covariance: Floats) -> Floats:
     return np.asarray(flat.reshape(rows.shape) @ np.swapaxes(rows, 1, 2))
 
 
-class Draws(NamedTuple):
-    """Fits at sizes drawn from their posterior.
-
-    Attributes:
-        fits: One fit for each draw.
-        chances: (F,) weights of the draws; they sum to one.
-    """
-
-    fits: tuple[Fit, ...]
-    chances: Floats
-
-
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Joint posterior of places and effects: a mixture of Gaussians over the sizes.
+    """Joint posterior of places and effects: an even mixture of Gaussians over the sizes.
 
     Attributes:
         model: The linearised sightings.
         mode: The fit at the most likely sizes.
-        draw: Draws the sizes, when they are first needed: a likelihood needs the mode alone.
+        draw: Fits at sizes drawn about their mode, once they are needed: a likelihood needs the
+            mode alone.
         cost: -2 log of the restricted likelihood times the sizes' prior at the mode, up to a
             constant.
     """
 
     model: LinearModel
     mode: Fit
-    draw: Callable[[], Draws]
+    draw: Callable[[], Sequence[Fit]]
     cost: float
 
     @cached_property
-    def draws(self) -> Draws:
-        """The fits at sizes drawn from their posterior."""
+    def fits(self) -> Sequence[Fit]:
+        """One fit for each draw of the sizes."""
         return self.draw()
 
     @cached_property
     def mean(self) -> Floats:
         """Mean (P + K,) of places and effects."""
-        return np.asarray(sum(c * f.mean for f, c in zip(*self.draws, strict=True)))
+        return np.asarray(np.mean([each.mean for each in self.fits], axis=0))
 
     @cached_property
     def covariance(self) -> Floats:
         """Covariance (P + K, P + K) of the mixture about its mean."""
-        fits, chances = self.draws
-        within = sum(c * f.covariance for f, c in zip(fits, chances, strict=True))
-        apart = np.array([f.mean - self.mean for f in fits])
-        return np.asarray(within + (apart.T * chances) @ apart)
+        within = sum(each.covariance for each in self.fits)
+        apart = np.array([each.mean - self.mean for each in self.fits])
+        return np.asarray((within + apart.T @ apart) / len(apart))
 
     def without(self, rows: Indices) -> Posterior:
         """Return the estimate without some sightings in closed form; variance components stay."""
         shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
-        mode, *fits = _without(taken, [self.mode, *self.draws.fits])
-        return self._with(self.model.weighted(shares), mode, fits)
+        mode, *fits = _without(taken, [self.mode, *self.fits])
+        left = self.model.weighted(shares)
+        return replace(self, model=left, mode=mode, draw=lambda: fits)
 
     def refitted(self, model: LinearModel) -> Posterior:
         """Return the estimate by another model of the sightings; variance components stay."""
-        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.draws.fits))
-        return self._with(model, mode, fits)
-
-    def _with(self, model: LinearModel, mode: Fit, fits: Sequence[Fit]) -> Posterior:
-        draws = Draws(tuple(fits), self.draws.chances)
-        return replace(self, model=model, mode=mode, draw=lambda: draws)
+        mode, *fits = (fit(model, each.sizes) for each in (self.mode, *self.fits))
+        return replace(self, model=model, mode=mode, draw=lambda: fits)
 
 
 def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
@@ -348,13 +333,12 @@ def shares(known: Posterior, rows: Floats) -> tuple[Floats, Floats]:
         Covariances (E, A, A) from each effect, and (A, A) from the noise.
     """
     effect, p = known.model.sizes.effect, known.model.p
-    fits, chances = known.draws
-    moved = np.array([rows @ each.covariance for each in fits])
-    sizes = np.array([each.sizes[effect] for each in fits])
-    scaled = moved[:, :, p:] * (np.sqrt(chances)[:, None] / sizes)[:, None]
+    moved = np.array([rows @ each.covariance for each in known.fits])
+    sizes = np.array([each.sizes[effect] for each in known.fits])
+    scaled = moved[:, :, p:] / (np.sqrt(len(moved)) * sizes)[:, None]
     parts = (scaled[:, :, effect == k] for k in range(int(effect.max(initial=-1)) + 1))
     of_effects = np.array([np.tensordot(each, each, axes=((0, 2), (0, 2))) for each in parts])
-    whole = np.tensordot(chances, moved, axes=1) @ rows.T
+    whole = moved.mean(axis=0) @ rows.T
     return of_effects, np.asarray(whole - of_effects.sum(axis=0))
 
 
@@ -412,30 +396,50 @@ def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
     return Posterior(model, at_mode, partial(_drawn, model, mode, at_mode), cost)
 
 
-def _drawn(model: LinearModel, mode: Peak, at_mode: Fit) -> Draws:
-    """Return the fits at sizes drawn about their mode, weighed by their posterior."""
-    (z, spread), some, prior = mode, model.subsampled(), model.sizes
-    fits, logs = [], []
-    # Half of them mirrored: beside 2,048 draws they state the error of 16 poses equally large,
-    # give or take 6 % from session to session
-    for draw in _draws(len(z), 32):
-        at = z + spread @ draw
-        found = fit(some, prior.at(at))
-        # Posterior exp(-(cost + z'z) / 2) over the density of the draw: the importance weight
-        logs.append(0.5 * float(draw @ draw - found.cost - at @ at))
-        fits.append(found)
-    chances = np.exp(np.array(logs) - max(logs))
-    # A third of the draws weigh less, and a fifth of a percent together
-    kept = np.flatnonzero(chances > 1e-3 * chances.sum())
-    fits, chances = [fits[k] for k in kept], chances[kept]
-    if some is not model:
-        # So many sightings determine the noise's own sizes to a few percent
-        own = model.factors
-        for k, each in enumerate(fits):
-            sizes = each.sizes.copy()
-            sizes[own] = at_mode.sizes[own]
-            fits[k] = _solved(model, sizes, at_mode.information, at_mode.right)
-    return Draws(tuple(fits), chances / chances.sum())
+def _drawn(model: LinearModel, mode: Peak, at_mode: Fit) -> list[Fit]:
+    """Return the fits at sizes drawn about their mode."""
+    some = model.subsampled()
+    # Evenly spread and mirrored, sixteen state the same errors as thirty-two
+    draws = _near_mode(some, mode, at_mode.sizes, _draws(len(mode.z), 16))
+    if some is model:
+        return [fit(model, model.sizes.at(z)) for z in draws]
+    # So many sightings determine the noise's own sizes to a few percent
+    sizes, own = np.array([model.sizes.at(z) for z in draws]), model.factors
+    sizes[:, own] = at_mode.sizes[own]
+    return [_solved(model, each, at_mode.information, at_mode.right) for each in sizes]
+
+
+def _near_mode(model: LinearModel, mode: Peak, sizes: Floats, draws: Floats) -> Floats:
+    r"""Return standard normal values (F, Z) of the sizes at draws (F, Z) about their mode.
+
+    The sightings determine their total noise, but hardly how much of it each cause adds. So where
+    the logarithms of the sizes change by d, and the causes have shares w of the variance, all of
+    them change by c more. The logarithm of the total then changes linearly, and the map keeps
+    volumes:
+
+    .. math:: c = \sum_k w_k d_k - \log(\sum_k w_k e^{2 d_k}) / 2
+    """
+    at, changes = draws @ mode.spread.T, draws @ mode.spread.T @ model.sizes.mix.T
+    own = np.unique(model.factors)
+    amounts, powers = sizes[model.factors].prod(axis=1), _powers(model)
+    each = np.einsum("cnij,nji->ci", model.causes, model.weights(sizes)) * amounts[:, None]
+    # Shares of the noise of turns and of shifts; a size counts where it matters more
+    both = (powers.T @ each / 2).reshape(-1, 2, 3).sum(axis=2)[own]
+    for part in range(2):
+        mine = own[both.argmax(axis=1) == part]
+        shares = both[both.argmax(axis=1) == part, part]
+        if not shares.any():
+            continue
+        shares, moved = shares / shares.sum(), changes[:, mine]
+        more = moved @ shares - 0.5 * np.log(np.exp(2 * moved) @ shares)
+        at[:, mine] += more[:, None] / model.sizes.mix[mine, mine]
+    return np.asarray(mode.z + at)
+
+
+def _powers(model: LinearModel) -> Floats:
+    """Return (C, S) how often each size is a factor of each cause of the noise."""
+    count = len(model.sizes.centre)
+    return np.asarray((model.factors[..., None] == np.arange(count)).sum(axis=1), dtype=float)
 
 
 def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:

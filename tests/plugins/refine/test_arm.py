@@ -27,7 +27,7 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.types.geometry import rigid
-from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
+from flangeye_emulators.world.arm import REAL, ArmErrors, ImperfectArm
 from flangeye_plugins.export.controllers import export_robot
 from flangeye_plugins.export.writing import NamedParams
 from flangeye_plugins.refine import ArmParams, refine_arm
@@ -135,7 +135,8 @@ def told_singly(found):
 
 def test_without_joint_angles_only_what_all_ways_to_the_poses_agree_on_is_identified() -> None:
     """An elbow that bends the other way explains the same scans by zeros of the other sign."""
-    observations = observed(40, 0, 0.5, ArmErrors(quality="real", zeros="3 mrad"))
+    # Play in the joints would tell from which side each came
+    observations = observed(40, 0, 0.5, REAL._replace(zeros=3e-3, backlash=0.0))
     without = [replace(o, joints=None) for o in observations]
     found = refine_arm(solved(without), fixed(ArmParams, propose=0), UR5)
     (said,) = [n for n in found.notes if "joint angles" in n]

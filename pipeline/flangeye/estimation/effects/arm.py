@@ -64,6 +64,9 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
         for kind, (name, ratio) in ARM_ERRORS.items():
             block = _of_carriers(arm, kind)
             effects.append(Effect(name, block, ratio * accuracy, QUALITY_SPREAD, arm, True, kind))
+        # A joint lags by half its play on either side: as much as it scatters in all
+        lag = 0.05 * accuracy
+        effects.append(Effect("backlash", _by_direction(arm), lag, QUALITY_SPREAD, arm))
     else:
         effects += [
             Effect(
@@ -99,19 +102,17 @@ class Scatter:
         covariances: Function that returns the (N, 6, 6) covariances at size 1.
         size: Prior median of the size.
         factor: Uncertainty of the size as a factor, one sigma.
-        cause: Cause whose quality it shares; empty for none.
     """
 
     covariances: Callable[[Problem, Linear], Floats]
     size: float
     factor: float
-    cause: str
 
 
 def arm_scatters(problem: Problem) -> list[Scatter]:
     """Return the arms' noise from pose to pose.
 
-    Backlash depends on the direction of approach. With unknown joint angles, what is not linear in
+    Joints do not stop alike each time. With unknown joint angles, what is not linear in
     the pose counts as noise too. What an arm repeats to says nothing of how true it is: this noise
     has a quality of its own.
     """
@@ -120,12 +121,12 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
         if _joints_of_all_known(problem, arm):
             # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
             # mm by ISO 9283 at a reach of a metre has 0.03 mrad
-            out.append(Scatter(_backlash(arm), 0.1 * accuracy, QUALITY, ""))
+            out.append(Scatter(_of_joints(arm), 0.1 * accuracy, QUALITY))
         else:
             turns, shifts = (_pose_noise(arm, rows) for rows in (slice(3), slice(3, 6)))
             turned, shifted = ANEW["each"]
-            out.append(Scatter(turns, turned * accuracy, QUALITY, ""))
-            out.append(Scatter(shifts, shifted * accuracy, QUALITY, ""))
+            out.append(Scatter(turns, turned * accuracy, QUALITY))
+            out.append(Scatter(shifts, shifted * accuracy, QUALITY))
     return out
 
 
@@ -140,7 +141,7 @@ def joints_known(carrier: Carrier) -> bool:
     return carrier.joints is not None and carrier.kinematics is not None
 
 
-def _backlash(arm: str) -> Callable[[Problem, Linear], Floats]:
+def _of_joints(arm: str) -> Callable[[Problem, Linear], Floats]:
     def covariances(problem: Problem, linear: Linear) -> Floats:
         moves = _of_carriers(arm, "zeros")(problem, linear)
         return np.asarray(moves @ np.swapaxes(moves, 1, 2))
@@ -167,6 +168,31 @@ def _of_carriers(arm: str, kind: str) -> Block:
         return np.asarray(sum(parts))
 
     return block
+
+
+def _by_direction(arm: str) -> Block:
+    """Return the design block of each joint's lag behind the direction in which it last moved.
+
+    At the work the directions are those from pose to pose too: any.
+    """
+
+    def block(problem: Problem, linear: Linear) -> Floats:
+        parts = []
+        for c in (c for c in problem.carriers if c.arm == arm):
+            _, joints = kinematics_and_joints(c)
+            lags = displacements(c)["zeros"] * _directions(joints)[:, None]
+            parts.append(linear.blocks[c.frame] @ lags[problem.seen.times])
+        return np.asarray(sum(parts))
+
+    return block
+
+
+def _directions(joints: Floats) -> Floats:
+    """Return (T, n) the sign of each joint's last move before a pose; 0 before it first moves."""
+    steps = np.diff(joints, axis=0, prepend=joints[:1])
+    # A joint at rest reports changes, but none of a tenth of a milliradian
+    moves = np.where(np.abs(steps) > 1e-4, np.arange(len(steps))[:, None], 0)
+    return np.take_along_axis(np.sign(steps), np.maximum.accumulate(moves, axis=0), axis=0)
 
 
 def _in_common(arm: str, at_base: bool, rows: slice) -> Block:

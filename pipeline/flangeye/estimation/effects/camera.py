@@ -90,8 +90,8 @@ def drift_effects(problem: Problem) -> list[Effect]:
     kinds = ("shift", 20e-6, slice(3, 6)), ("turn", 20e-6, slice(0, 3))
     return [
         # By how many times it may be more or less, one sigma
-        Effect(f"drift of {camera}", _drift(camera, knots, rows), size, 4.0,
-               f"drift of {camera}", kind="drift", lasting=False)
+        Effect(f"drift of {camera}", _drift(camera, knots, rows), size, 4.0, kind="drift",
+               lasting=False)
         for camera in cameras for _, size, rows in kinds
     ]  # fmt: skip
 
@@ -99,13 +99,14 @@ def drift_effects(problem: Problem) -> list[Effect]:
 def _drift(camera: str, knots: int, rows: slice) -> Block:
     def block(problem: Problem, linear: Linear) -> Floats:
         s, count = problem.seen, len(problem.seen)
-        out = np.zeros((count, 6, 3 * knots))
         at = np.linspace(0, knots - 1, count)[np.argsort(np.argsort(s.times))]
         hats = np.maximum(1 - np.abs(at[:, None] - np.arange(knots)), 0.0)
-        # The mean of a drift is the camera's place itself
-        hats = hats - hats.mean(axis=0)
+        # The mean of a drift is the camera's place itself, so one number fewer than knots is left
+        shapes, sizes, _ = np.linalg.svd(hats - hats.mean(axis=0), full_matrices=False)
+        hats = (shapes * sizes)[:, :-1]
         whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
-        moved = hats[:, :, None, None] * np.eye(3)  # (N, knots, 3, 3)
+        moved = hats[:, :, None, None] * np.eye(3)  # (N, knots - 1, 3, 3)
+        out = np.zeros((count, 6, 3 * (knots - 1)))
         out[:, rows] = np.swapaxes(moved, 1, 2).reshape(count, 3, -1) * whose[:, None, None]
         return out
 
