@@ -1,11 +1,22 @@
 """Which of the readings of a marker session that fit alike is meant: on known places."""
 
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from flangeye.estimation.readings import Axes, Pairs, Reading, likely, optical, other_axes
+from flangeye.estimation import session
+from flangeye.estimation.estimate import estimate
+from flangeye.estimation.readings import (
+    Axes,
+    Pairs,
+    Reading,
+    estimated,
+    likely,
+    optical,
+    other_axes,
+)
 from flangeye.types import Floats
 from flangeye.types.geometry import invert
 from tests.estimation import foreign
@@ -67,3 +78,17 @@ def test_exchanged_tables_are_exchanged_back(kind: str) -> None:
 def test_a_frame_with_other_axes_is_named(name: Axes) -> None:
     places = sound("marker")[0].marker[:, :3, 3]
     assert other_axes(places @ optical(name)) == name
+
+
+def test_an_estimate_takes_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many small matrices on two threads take three times the processor's time."""
+    threads: set[int] = set()
+
+    def watched(*given: Any) -> Any:
+        threads.update(each["num_threads"] for each in threadpool_info())
+        return estimate(*given)
+
+    monkeypatch.setattr(session, "estimate", watched)
+    with threadpool_limits(2):
+        assert estimated(sound("marker")[0], MODEL)
+    assert threads == {1}

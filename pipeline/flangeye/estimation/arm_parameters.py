@@ -15,6 +15,7 @@ from flangeye.estimation.mixed import fit
 from flangeye.estimation.plan import most_informative, whitened
 from flangeye.estimation.session import Session
 from flangeye.estimation.sightings import branches_of
+from flangeye.estimation.threads import on_one_thread
 from flangeye.types import FLANGE, Floats, Indices, Mask, Observation
 
 KNOWN = 0.5
@@ -53,6 +54,7 @@ class ArmParameters:
         return int((np.linalg.eigvalsh(self.alone) <= KNOWN**2).sum())
 
 
+@on_one_thread
 def parameters_of(session: Session) -> ArmParameters:
     """Return the estimated parameters, with covariance, of the arm that moves the flange.
 

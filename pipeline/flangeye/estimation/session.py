@@ -28,6 +28,7 @@ from flangeye.estimation.observability import (
 )
 from flangeye.estimation.sightings import branches_of, problem_of
 from flangeye.estimation.start import agreeing, distances, initial_guess, size_of
+from flangeye.estimation.threads import on_one_thread
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.models.cell import Cell
@@ -107,6 +108,7 @@ class Session:
         return replace(self, found=found)
 
 
+@on_one_thread
 def session_of(
     observations: Sequence[Observation],
     cell: Cell,
