@@ -150,3 +150,9 @@ def test_a_line_of_blanks_is_read_in_linear_time(tmp_path: Path, end: str) -> No
     (tmp_path / "a.txt").write_text("1 2 3" + " " * 400_000 + end + "\n4 5 6\n7 8 9\n")
     rows = read_table(tmp_path, "a.txt").rows  # in quadratic time it would take 20 minutes
     assert [cells[:3] for _, cells in rows] == [tuple("123"), tuple("456"), tuple("789")]
+
+
+def test_a_line_of_one_separator_has_no_cells(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("|\n1|2|3|\n4|5|6|\n7|8|9|\n|\n")
+    table = read_table(tmp_path, "a.txt")
+    assert [cells for _, cells in table.rows if len(cells) == 3][-1] == ("7", "8", "9")

@@ -543,7 +543,7 @@ class _splitter:  # noqa: N801  a function with a memory
         (cells,) = csv.reader([line], delimiter=self.mark, skipinitialspace=True)
         cells = [_bare(cell) for cell in cells]
         # A mark at the end of each line makes an empty last cell.
-        return tuple(cells[:-1] if self.ended and not cells[-1] else cells)
+        return tuple(cells[:-1] if self.ended and cells[-1:] == [""] else cells)
 
 
 def _bare(cell: str) -> str:
