@@ -10,9 +10,9 @@ where p moves the unknown places and each effect E_k is a possible error of the 
 along the line of sight and across it, and other noise T_m that varies from sighting to sighting.
 Sizes s_k, D and t_m maximise the restricted likelihood (REML, Patterson & Thompson 1971) times
 their priors. A dozen sightings do not determine them, so they are drawn about that mode (Laplace's
-approximation). Henderson's mixed-model equations give p and delta at every set of
-sizes by one Cholesky factorisation of as many unknowns as places and effects have: the cost is
-linear in N. Arrays only.
+approximation). Henderson's mixed-model equations give p and delta at every set of sizes by one
+Cholesky factorisation of as many unknowns as places and effects have: the cost is linear in N.
+Arrays only.
 """
 
 from __future__ import annotations
@@ -425,12 +425,12 @@ def _near_mode(model: LinearModel, mode: Peak, sizes: Floats, draws: Floats) -> 
     each = np.einsum("cnij,nji->ci", model.causes, model.weights(sizes)) * amounts[:, None]
     # Shares of the noise of turns and of shifts; a size counts where it matters more
     both = (powers.T @ each / 2).reshape(-1, 2, 3).sum(axis=2)[own]
-    for part in range(2):
-        mine = own[both.argmax(axis=1) == part]
-        shares = both[both.argmax(axis=1) == part, part]
-        if not shares.any():
+    for part, of_part in enumerate(both.T):
+        here = both.argmax(axis=1) == part
+        mine, whole = own[here], of_part[here].sum()
+        if not whole:  # centres have no turns
             continue
-        shares, moved = shares / shares.sum(), changes[:, mine]
+        shares, moved = of_part[here] / whole, changes[:, mine]
         more = moved @ shares - 0.5 * np.log(np.exp(2 * moved) @ shares)
         at[:, mine] += more[:, None] / model.sizes.mix[mine, mine]
     return np.asarray(mode.z + at)

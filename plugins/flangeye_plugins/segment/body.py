@@ -230,9 +230,10 @@ def _misdrawn(
     for pose in (one.pose for one in every):
         gone = contradicted_facets(shape, view, pose)
         if gone is not None:
-            rest = Looks(vertices, facets[~gone].astype(np.int32), mounted=True)
-            search = rests.setdefault(gone.tobytes(), BodySearch(points, rest, holds))
-            near = filter(holds, search.near(pose[None], trust=0.93))
+            if gone.tobytes() not in rests:  # a mesh is prepared once, though many poses lack it
+                rest = Looks(vertices, facets[~gone].astype(np.int32), mounted=True)
+                rests[gone.tobytes()] = BodySearch(points, rest, holds)
+            near = filter(holds, rests[gone.tobytes()].near(pose[None], trust=0.93))
             held += [(one.verdict.score, vertices[facets[gone]]) for one in near]
     if not held:
         return None

@@ -64,9 +64,10 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
         for kind, (name, ratio) in ARM_ERRORS.items():
             block = _of_carriers(arm, kind)
             effects.append(Effect(name, block, ratio * accuracy, QUALITY_SPREAD, arm, True, kind))
-        # A joint lags by half its play on either side: as much as it scatters in all
-        lag = 0.05 * accuracy
-        effects.append(Effect("backlash", _by_direction(arm), lag, QUALITY_SPREAD, arm))
+        # Half the play is lost on either side. No command contains it: at the work a joint comes
+        # from either side
+        lag, block = 0.05 * accuracy, _of_carriers(arm, "backlash")
+        effects.append(Effect("backlash", block, lag, QUALITY_SPREAD, arm))
     else:
         effects += [
             Effect(
@@ -112,8 +113,8 @@ class Scatter:
 def arm_scatters(problem: Problem) -> list[Scatter]:
     """Return the arms' noise from pose to pose.
 
-    Joints do not stop alike each time. With unknown joint angles, what is not linear in
-    the pose counts as noise too. What an arm repeats to says nothing of how true it is: this noise
+    A joint does not stop at the same angle each time. With unknown joint angles, what is not linear
+    in the pose counts as noise too. An arm's repeatability says nothing of its accuracy: this noise
     has a quality of its own.
     """
     out = []
@@ -168,31 +169,6 @@ def _of_carriers(arm: str, kind: str) -> Block:
         return np.asarray(sum(parts))
 
     return block
-
-
-def _by_direction(arm: str) -> Block:
-    """Return the design block of each joint's lag behind the direction in which it last moved.
-
-    At the work the directions are those from pose to pose too: any.
-    """
-
-    def block(problem: Problem, linear: Linear) -> Floats:
-        parts = []
-        for c in (c for c in problem.carriers if c.arm == arm):
-            _, joints = kinematics_and_joints(c)
-            lags = displacements(c)["zeros"] * _directions(joints)[:, None]
-            parts.append(linear.blocks[c.frame] @ lags[problem.seen.times])
-        return np.asarray(sum(parts))
-
-    return block
-
-
-def _directions(joints: Floats) -> Floats:
-    """Return (T, n) the sign of each joint's last move before a pose; 0 before it first moves."""
-    steps = np.diff(joints, axis=0, prepend=joints[:1])
-    # A joint at rest reports changes, but none of a tenth of a milliradian
-    moves = np.where(np.abs(steps) > 1e-4, np.arange(len(steps))[:, None], 0)
-    return np.take_along_axis(np.sign(steps), np.maximum.accumulate(moves, axis=0), axis=0)
 
 
 def _in_common(arm: str, at_base: bool, rows: slice) -> Block:
@@ -259,11 +235,20 @@ def displacements(carrier: Carrier) -> dict[str, Floats]:
     # An eccentric encoder disc errs once a turn, e sin q + f cos q; a joint sags by the torque
     return {
         "zeros": columns,
+        "backlash": columns * _directions(joints)[:, None],
         "encoders": (columns[:, :, None, :] * waves[:, None]).reshape(len(joints), 6, -1),
         "sag": columns * _levers(arm, joints)[:, None],
         "lengths": links[..., :2].reshape(len(joints), 6, -1),
         "twists": links[..., 2],
     }
+
+
+def _directions(joints: Floats) -> Floats:
+    """Return (T, n) the sign of each joint's last move before a pose; 0 before it first moves."""
+    steps = np.diff(joints, axis=0, prepend=joints[:1])
+    # A joint at rest reports changes, but none of a tenth of a milliradian
+    moves = np.where(np.abs(steps) > 1e-4, np.arange(len(steps))[:, None], 0)
+    return np.take_along_axis(np.sign(steps), np.maximum.accumulate(moves, axis=0), axis=0)
 
 
 def _levers(arm: Arm, joints: Floats) -> Floats:
