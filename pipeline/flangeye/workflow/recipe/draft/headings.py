@@ -320,9 +320,9 @@ def _of_list(listed: str, axis: str) -> list[str]:
 
 def _words(name: str) -> list[str]:
     """Return the words of a column's name; R of ``R_gripper2base`` is one."""
-    # A unit's sign, or Chinese beside Latin letters, ends a word: 位置X(毫米)
-    apart = re.sub(r"([\u3400-\u9fff]+)", r" \1 ", in_english(name).replace("°", " deg "))
-    joined = in_english(" ".join(w for w in re.split(r"[\W_]+", apart) if w))
+    # Chinese beside Latin letters, or a unit's sign, ends a word: 位置X(毫米)
+    apart = in_english(re.sub(r"([\u3400-\u9fff]+)", r" \1 ", name)).replace("°", " deg ")
+    joined = " ".join(w for w in re.split(r"[\W_]+", apart) if w)
     for two, one in (
         (r"rot(?:ation)? vec(?:tor)?|axis angle", "rotvec"), (r"rot(?:ation)? quat\w*", "quat"),
         (r"trans(?:lation)? vec(?:tor)?", "tvec"), (r"rot(?:ation)? mat(?:rix)?", "rotation"),
