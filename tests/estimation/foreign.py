@@ -8,9 +8,11 @@ estimator describes as they are made here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
 
 UR5E = dict(
     name="ur5e",
@@ -247,12 +249,12 @@ def _noisy(kind, exact, rng):
 # --- the truth of both answers ------------------------------------------------------------------
 
 
-def work(s: Session, count: int = 6000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return flange poses of the work, reported and real (N, 4, 4), over the box."""
-    rng = np.random.default_rng(12345)
+def work(s: Session, count: int = 4096) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return flange poses of the work, reported and real (N, 4, 4), spread evenly over the box."""
+    evenly = qmc.Sobol(4, rng=12345).random(count)
     targets = np.tile(np.eye(4), (count, 1, 1))
-    targets[:, :3, :3] = s.turns[rng.integers(0, len(s.turns), count)]
-    targets[:, :3, 3] = rng.uniform(s.box[0], s.box[1], (count, 3))
+    targets[:, :3, :3] = s.turns[(evenly[:, 3] * len(s.turns)).astype(int)]
+    targets[:, :3, 3] = s.box[0] + (s.box[1] - s.box[0]) * evenly[:, :3]
     q = joints_at(s.arm, targets, s.arm["home"])
     good = np.isfinite(q).all(axis=1)
     q = q[good]
@@ -278,13 +280,14 @@ def reported_camera(s: Session, reported: np.ndarray, real: np.ndarray) -> np.nd
     if not s.in_hand:
         return onto @ s.camera
     # A camera in hand: everything it sees from poses of the work, where reported coordinates have
-    # it; the points lie on the table about the target.
-    rng = np.random.default_rng(7)
-    about = s.target[:3, 3] + rng.uniform(-0.05, 0.05, (len(real), 3))
-    seen = (
-        np.einsum("nij,nj->ni", np.linalg.inv(real @ s.camera)[:, :3, :3], about)
-        + np.linalg.inv(real @ s.camera)[:, :3, 3]
-    )
+    # it; the points lie on the table about the target. Eight have the means of a cube of 100 mm.
+    about = s.target[:3, 3] + 0.05 / np.sqrt(3) * np.array(list(product((-1, 1), repeat=3)))
+    seen = _from(real @ s.camera, about)
     wanted = about @ onto[:3, :3].T + onto[:3, 3]
-    in_flange = np.einsum("nji,nj->ni", reported[:, :3, :3], wanted - reported[:, :3, 3])
-    return best_rigid(seen, in_flange)
+    return best_rigid(seen, _from(reported, wanted))
+
+
+def _from(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return (N M, 3) points (M, 3) as each of (N, 4, 4) poses has them."""
+    apart = points - poses[:, None, :3, 3]
+    return np.einsum("nji,nmj->nmi", poses[:, :3, :3], apart).reshape(-1, 3)

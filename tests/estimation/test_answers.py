@@ -5,6 +5,7 @@ Against least squares written out at every pose of the work.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,9 @@ def session(request: pytest.FixtureRequest) -> tuple[str, Estimate, Work]:
     return request.param, found, work_of(found.problem, found.places)
 
 
-def fitted(by: Floats, moved: Floats, weights: Floats) -> Floats:
+def fitted(by: Floats, moved: Floats, weights: Floats, turn: float = TURN) -> Floats:
     """Return (6, K) by which (W, 6, 6) explain (W, 6, K) best, with weights (W,)."""
-    own = np.repeat([TURN, 1.0], 3)
+    own = np.repeat([turn, 1.0], 3)
     left = (np.swapaxes(by, 1, 2) * own**2 * weights[:, None, None]).swapaxes(0, 1).reshape(6, -1)
     rows, right = (each.reshape(-1, each.shape[2]) for each in (by, moved))
     return np.asarray(np.linalg.solve(left @ rows, left @ right))
@@ -105,7 +106,10 @@ def test_a_place_on_the_arm_takes_up_what_the_arm_does_beside(session: Any) -> N
     about[3:, :3] = -hat(at)
     for told, weights in zip(commanded(found, work), work.boxes, strict=True):
         stands = linear.blocks[names[0]] @ (-about @ world_of(found, work, weights))
-        expected = fitted(linear.blocks[names[1]], moved - stands + focal, weights)
+        # Eight corners of a cube of 100 mm about the target, moved by a turn of 1 rad
+        corners = 0.05 / np.sqrt(3) * np.array(list(product((-1, 1), repeat=3)))
+        lever = np.hypot(TURN, np.sqrt((corners[:, :2] ** 2).sum(axis=1).mean()))
+        expected = fitted(linear.blocks[names[1]], moved - stands + focal, weights, lever)
         rows = told[6 * carried : 6 * carried + 6]
         np.testing.assert_allclose(rows, expected, rtol=1e-5, atol=1e-6)
         # What the first joint does is a motion of the base, of which nothing is left

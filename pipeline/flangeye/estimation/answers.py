@@ -114,10 +114,13 @@ class _Commands:
         world, out = self._world, [np.zeros((len(self.boxes), 0, self._of_arm.shape[2]))]
         for name in self.found.problem.unknown:
             carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
-            out.append((self._carried if carried else self._fixed)(name, world))
+            # A camera in hand is to see all that is up to 50 mm about the target where it is
+            about = 0.05 if carried else 0.0
+            out.append(self._carried(name, world, about) if carried else self._fixed(name, world))
             # Its lasting errors move what it reports at the work as they did in the session
             if any(name == camera for camera, _ in self.work.ends):
-                out[-1] = out[-1] + self._explained(self._linear.blocks[name], self._of_camera)
+                of_camera = self._explained(self._linear.blocks[name], self._of_camera, about)
+                out[-1] = out[-1] + of_camera
         return np.concatenate(out, axis=1)
 
     @cached_property
@@ -156,12 +159,16 @@ class _Commands:
             out[carrier.frame] = self._explained(motions, twists)
         return out
 
-    def _explained(self, by: Floats, moved: Floats) -> Floats:
-        """Return (B, 6, K): twists ``moved`` (W, 6, K), fitted over each box by least squares."""
-        # Turns count like what they do so far from the flange [m]: enough to determine the turn
-        # about a line where the work is in one, and no more, for the work is at positions. At 20 mm
-        # an arm of 3 mrad turned the answer by 0.15 mrad, as much as 60 poses leave uncertain
-        weight = np.repeat([0.002, 1.0], 3)[:, None]
+    def _explained(self, by: Floats, moved: Floats, about: float = 0.0) -> Floats:
+        """Return (B, 6, K): twists ``moved`` (W, 6, K), fitted over each box by least squares.
+
+        Turns count like what they do to a cube of 2 ``about`` [m].
+        """
+        # And like what they do 2 mm away: enough to determine the turn about a line where the work
+        # is in one, and no more, for the work is at positions. At 20 mm an arm of 3 mrad turned the
+        # answer by 0.15 mrad, as much as 60 poses leave uncertain
+        lever = np.hypot(0.002, about * np.sqrt(2 / 3))
+        weight = np.repeat([lever, 1.0], 3)[:, None]
         across = np.swapaxes(weight**2 * by, 1, 2)
         gram, right = (np.tensordot(self.boxes, across @ each, axes=1) for each in (by, moved))
         return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
@@ -201,14 +208,14 @@ class _Commands:
         shift[3:, :3] = -hat(known[name][:3, 3])
         return np.asarray(shift @ adjoint(invert(parent)) @ gauge)
 
-    def _carried(self, name: str, world: Floats) -> Floats:
+    def _carried(self, name: str, world: Floats, about: float) -> Floats:
         """Return the (B, 6, K) motion that explains the displacements of a place on an arm best.
 
         A camera in hand must see everything where reported coordinates have it.
         """
         by = self._linear.blocks[name]
-        of_world = self._explained(by, self._seen_of_world(name))
-        return self._explained(by, self._of_arm) + of_world @ world
+        of_world = self._explained(by, self._seen_of_world(name), about)
+        return self._explained(by, self._of_arm, about) + of_world @ world
 
     def _seen_of_world(self, name: str) -> Floats:
         """Return (W, 6, 6): how a twist of reported root coordinates moves the sighted targets.

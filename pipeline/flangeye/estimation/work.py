@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
 
 import numpy as np
 
@@ -11,7 +13,7 @@ from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import spread_evenly
 from flangeye.models.cell import composed
-from flangeye.types import Box, Floats
+from flangeye.types import Box, Floats, Indices
 from flangeye.types.geometry import invert, skew_parts
 
 COUNT = 256
@@ -58,7 +60,7 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     if box is not None:
         sides = np.asarray(box.centre) + np.array([[-0.5], [0.5]]) * box.size
         filled = _simulated(_in_box(problem, carrier, sides), places)
-        return Work(filled, filled, _weights(filled, rotations, sides)[None])
+        return Work(filled, filled, _weights(filled, rotations, sides[None]))
     inner = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
     outward = (inner[1] - inner[0]) / max(n - 1, 1) * np.array([[-1.0], [1.0]])
     widest = 2.5  # spacings of poses that a box reaches beyond these
@@ -66,8 +68,7 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     # Eight boxes that the poses may have been drawn from, equally likely: from the outermost of n
     # evenly drawn poses to the box's side the distance is exponential, with the spacing as mean
     beyond = np.random.default_rng(0).exponential(size=(8, 2, 3)).clip(max=widest)
-    boxes = [_weights(wide, rotations, inner + each * outward) for each in beyond]
-    return Work(session, wide, np.array(boxes))
+    return Work(session, wide, _weights(wide, rotations, inner + beyond * outward))
 
 
 def _all_of(work: Problem) -> Work:
@@ -78,34 +79,48 @@ def _simulated(work: Problem, places: Places) -> Problem:
     return replace(work, seen=_predicted(work, places))
 
 
-def _weights(work: Problem, rotations: Floats, box: Floats) -> Floats:
-    """Return weights (W,) with which sightings stand for all poses in a box (2, 3).
+def _weights(work: Problem, rotations: Floats, boxes: Floats) -> Floats:
+    """Return weights (B, W) with which sightings stand for all poses in each of (B, 2, 3) boxes.
 
-    The box has each orientation of the session (N, 3, 3) at each place. The sightings in it are
-    weighted evenly, and then as little otherwise as gives places, turns, and the products of any
-    two the means that they have over the box: so 256 sightings are as good as thousands.
+    A box has each orientation of the session (N, 3, 3) at each place. The sightings in it are
+    weighted evenly, and then as little otherwise as gives the products of up to three numbers of
+    places and turns the means that they have over the box.
     """
     poses = np.asarray(work.frames[work.carriers[0].frame].place)[work.seen.times]
-    half = (box[1] - box[0]) / 2
-    at = (poses[:, :3, 3] - box.mean(axis=0)) / np.where(half > 0, half, np.inf)
-    inside = (np.abs(at) <= 1 + 1e-9).all(axis=1)
-    if not inside.any():  # a box without any reachable pose must still give an average
-        return np.full(len(at), 1 / len(at))
-    middle = rotations.mean(axis=0)
-    turns, every = (skew_parts(each @ middle.T) for each in (poses[:, :3, :3], rotations))
-    numbers = np.hstack([np.ones((len(at), 1)), at, turns])[inside]
-    # Places are even between -1 and 1 where the arm reaches all of them, and independent of turns
-    means = np.diag([1.0, *[1 / 3] * 3, 0.0, 0.0, 0.0])
-    if len(poses) < COUNT:
-        means[:4, :4] = numbers[:, :4].T @ numbers[:, :4] / len(numbers)
-    means[:4, 4:] = np.outer(means[0, :4], every.mean(axis=0))
-    means[4:, 4:] = every.T @ every / len(every)
-    pairs = np.triu_indices(7)
-    products = numbers[:, pairs[0]] * numbers[:, pairs[1]]
-    off = means[pairs] - products.mean(axis=0)
-    weights = inside / len(numbers)
-    weights[inside] += np.linalg.lstsq(products.T, off, rcond=1e-6)[0]
-    return np.asarray(weights)
+    at, centres, halves = poses[:, :3, 3], boxes.mean(axis=1), np.ptp(boxes, axis=1) / 2
+    inside = (np.abs(at - centres[:, None]) < halves[:, None] + 1e-9).all(axis=2)
+    # A box without any reachable pose must still give a mean
+    inside = np.where(inside.any(axis=1, keepdims=True), inside, True)
+    even = inside / inside.sum(axis=1, keepdims=True)
+    middle, turned = centres.mean(axis=0), rotations.mean(axis=0)
+    wide = halves.max(axis=0)
+    wide[wide == 0] = np.inf
+    turns, every = (_products(skew_parts(r @ turned.T)) for r in (poses[:, :3, :3], rotations))
+    places = _products((at - middle) / wide)
+    means = even @ places
+    if len(poses) == COUNT:  # the arm reaches all places: their means are those of Gauss's points
+        gauss = np.array(list(product((-1, 1), repeat=3))) / np.sqrt(3)
+        points = centres[:, None] + halves[:, None] * gauss
+        means = _products((points - middle) / wide).mean(axis=1)
+    # Of both, those with three factors at most
+    some = np.add.outer(_factors().sum(axis=1), _factors().sum(axis=1)) <= 3
+    products = (places[:, :, None] * turns[:, None])[:, some]
+    off = (means[:, :, None] * every.mean(axis=0))[:, some] - even @ products
+    gram = np.swapaxes(products * even[..., None], 1, 2) @ products
+    # Numbers that do not vary have no share, by a ridge far below what the others leave
+    shares = np.linalg.solve(gram + 1e-10 * np.eye(len(gram[0])), off[..., None])
+    return np.asarray(even * (1 + (products @ shares)[..., 0]))
+
+
+def _products(numbers: Floats) -> Floats:
+    """Return (..., 20) the products of up to three of (..., 3) numbers."""
+    return np.asarray(np.prod(numbers[..., None, :] ** _factors(), axis=-1))
+
+
+@cache
+def _factors() -> Indices:
+    """Return (20, 3) how often each of three numbers is a factor of each product of up to three."""
+    return np.array([each for each in product(range(4), repeat=3) if sum(each) <= 3])
 
 
 def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
