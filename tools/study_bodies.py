@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from flangeye.estimation.ambiguity import disambiguated
+from flangeye.estimation.start.ambiguity import disambiguated
 from flangeye.models.bodies import TargetBody, load_body
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration

@@ -11,7 +11,7 @@ from flangeye.estimation.arm_parameters import ArmParameters, most_informative_p
 from flangeye.estimation.calibrate import Options, answered
 from flangeye.estimation.effects.arm import kinematics_and_joints
 from flangeye.estimation.plan import predict, predicted_poses
-from flangeye.estimation.session import Session, session_of
+from flangeye.estimation.session.session import Session, session_of
 from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import cell_of

@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.estimation.closed import at_once, separable
+from flangeye.estimation.closed import at_once, motions
 from flangeye.estimation.closed.comanipulation import alternate, random_rotations
-from flangeye.estimation.closed.motions import motions_of
-from flangeye.estimation.sightings import problem_of
+from flangeye.estimation.start.sightings import problem_of
 from flangeye.models.cell import cell_of
 from flangeye.types.geometry import rotation_log
 from flangeye_plugins.solve.robust import (
@@ -33,10 +32,10 @@ from tests.estimation.cells import CONFIGURATIONS, session
 MARKER = CONFIGURATIONS["eye-in-hand, marker"]
 CASES = {"n=15, 17 deg": (15, np.radians(17)), "n=8, 30 deg": (8, np.radians(30))}
 BY_MOTIONS = {
-    "tsai_lenz": separable.tsai_lenz,
-    "park_martin": separable.park_martin,
-    "horaud_dornaika": separable.horaud_dornaika,
-    "andreff": separable.andreff,
+    "tsai_lenz": motions.tsai_lenz,
+    "park_martin": motions.park_martin,
+    "horaud_dornaika": motions.horaud_dornaika,
+    "andreff": motions.andreff,
     "daniilidis": at_once.daniilidis,
 }
 BY_BOTH = {"shah": at_once.shah, "li": at_once.li}
@@ -60,7 +59,7 @@ def closed(name: str, made) -> np.ndarray:
     carried, seen = arrays(made)
     if name in BY_BOTH:
         return BY_BOTH[name](carried, seen)[0]
-    return BY_MOTIONS[name](motions_of(carried, seen))
+    return BY_MOTIONS[name](motions.motions_of(carried, seen))
 
 
 def most_likely(made) -> np.ndarray:

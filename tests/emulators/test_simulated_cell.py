@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.estimation.sightings import branches_of, problem_of
+from flangeye.estimation.start.sightings import branches_of, problem_of
 from flangeye.files.paths import bundled
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Cell

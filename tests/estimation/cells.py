@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from flangeye.estimation.graph import Problem
-from flangeye.estimation.sightings import problem_of
+from flangeye.estimation.start.sightings import problem_of
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.streams import joints_at, passed, pose_at, with_joints
 from flangeye.models.cell import Frame, cell_of

@@ -10,11 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flangeye.estimation.answers import Answer, as_reported, as_true, expected_error, predicted_work
+from flangeye.estimation.answers.answer import (
+    Answer,
+    as_reported,
+    as_true,
+    expected_error,
+    predicted_work,
+)
+from flangeye.estimation.answers.work import work_of
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier, Problem, Sightings
-from flangeye.estimation.session import ModelOptions, effects_of
-from flangeye.estimation.work import work_of
+from flangeye.estimation.session.session import ModelOptions, effects_of
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Frame
 from flangeye.models.model import read_model

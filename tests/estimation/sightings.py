@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.estimation.lifted import Factors, LiftedSightings
+from flangeye.estimation.certify.lifted import Factors, LiftedSightings
 from flangeye.types import Floats
 from flangeye.types.geometry import invert, rigid, rotation_exp, rotation_log
 

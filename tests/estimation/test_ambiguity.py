@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.estimation.ambiguity import ambiguous, disambiguated
+from flangeye.estimation.start.ambiguity import ambiguous, disambiguated
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import ORIGIN, Configuration
 from flangeye.types import (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.answers import (
+from flangeye.estimation.answers.answer import (
     Answer,
     PredictedWork,
     adjoint,
@@ -20,10 +20,10 @@ from flangeye.estimation.answers import (
     commanded,
     expected_error,
 )
-from flangeye.estimation.corrections import corrected_part, corrections_of
+from flangeye.estimation.answers.corrections import corrected_part, corrections_of
+from flangeye.estimation.answers.work import Work, work_of
 from flangeye.estimation.effects.arm import COMMON, displacements
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.work import Work, work_of
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.types import Floats
 from flangeye.types.geometry import hat, invert, levers, rigid, rotation_exp, rotation_log

@@ -3,7 +3,7 @@
 import numpy as np
 
 from flangeye.estimation.arm_parameters import parameters_of
-from flangeye.estimation.session import ModelOptions, Session
+from flangeye.estimation.session.session import ModelOptions, Session
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT
 from tests.estimation import foreign

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation import certificate, certified
-from flangeye.estimation.certificate import GAP, Certificate, _Dual, certify
-from flangeye.estimation.certified import NOT_CERTIFIED, OPTIMAL
-from flangeye.estimation.lifted import LiftedSightings, squares_of
+from flangeye.estimation.certify import certificate, certified
+from flangeye.estimation.certify.certificate import GAP, Certificate, _Dual, certify
+from flangeye.estimation.certify.certified import NOT_CERTIFIED, OPTIMAL
+from flangeye.estimation.certify.lifted import LiftedSightings, squares_of
 from flangeye.types import Floats
 from flangeye.types.geometry import invert
 from tests.estimation.cells import CONFIGURATIONS, session, solved

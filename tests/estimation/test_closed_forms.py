@@ -114,9 +114,9 @@ def test_a_camera_turned_by_half_a_turn_is_no_exception(name: str) -> None:
         z = rigid(rotation(rng), rng.normal(0, 0.3, 3))
         carried = moves(rng, 8, 0.4)
         seen = invert(carried @ x) @ z
-        from flangeye.estimation.closed import separable
+        from flangeye.estimation.closed import motions
 
-        found = getattr(separable, name)(motions_of(carried, seen))
+        found = getattr(motions, name)(motions_of(carried, seen))
         assert np.allclose(found, x, atol=1e-9)
 
 

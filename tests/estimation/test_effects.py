@@ -17,7 +17,7 @@ from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.effects.scanner import DistortionField
 from flangeye.estimation.effects.target import offset_shown_to, wrong_offset
 from flangeye.estimation.graph import Carrier, Problem, Sightings
-from flangeye.estimation.session import ModelOptions, effects_of
+from flangeye.estimation.session.session import ModelOptions, effects_of
 from flangeye.models.cell import Frame
 from flangeye.models.loading import load_model
 from flangeye.types import Floats

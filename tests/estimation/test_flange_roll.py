@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.sightings import roll_note, roll_of
+from flangeye.estimation.start.sightings import roll_note, roll_of
 from flangeye.types import Floats
 from flangeye.types.geometry import basis_of_plane, rotation_exp
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.certificate import certify
-from flangeye.estimation.lifted import squares_of
+from flangeye.estimation.certify.certificate import certify
+from flangeye.estimation.certify.lifted import squares_of
 from flangeye.types import Floats
 from flangeye.types.geometry import invert, rotation_exp
 from tests.estimation.sightings import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flangeye.estimation.closed.linear import entries, least_squares
+from flangeye.estimation.start.loops import entries, least_squares
 from flangeye.types.geometry import rotation_exp
 
 

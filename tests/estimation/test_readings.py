@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from flangeye.estimation import session
 from flangeye.estimation.estimate import estimate
-from flangeye.estimation.readings import (
+from flangeye.estimation.session import session
+from flangeye.estimation.session.readings import (
     Axes,
     Pairs,
     Reading,

@@ -12,7 +12,7 @@ import pytest
 
 from flangeye.errors import CalibrationRefused
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.start import (
+from flangeye.estimation.start.loops import (
     agreeing,
     distances,
     initial_guess,

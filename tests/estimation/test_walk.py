@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flangeye.estimation.effects.walk import innovations
-from flangeye.estimation.session import Session, session_of
+from flangeye.estimation.session.session import Session, session_of
 from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import Configuration

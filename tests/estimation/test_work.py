@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flangeye.estimation.answers.work import Work, work_of
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.plan import most_informative, work_of_frames
-from flangeye.estimation.work import Work, work_of
 from flangeye.types import Box, Floats
 from flangeye.types.geometry import invert, rigid, rotation_exp
 from tests.estimation import foreign

@@ -13,9 +13,9 @@ from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Carrier
 from flangeye.estimation.mixed import fit
 from flangeye.estimation.plan import most_informative, whitened
-from flangeye.estimation.session import Session
-from flangeye.estimation.sightings import branches_of
-from flangeye.estimation.threads import on_one_thread
+from flangeye.estimation.session.session import Session
+from flangeye.estimation.start.sightings import branches_of
+from flangeye.maths.threads import on_one_thread
 from flangeye.types import FLANGE, Floats, Indices, Mask, Observation
 
 KNOWN = 0.5

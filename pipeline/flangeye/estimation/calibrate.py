@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.estimation.answers import (
+from flangeye.estimation.answers.answer import (
     Answer,
     as_reported,
     as_true,
@@ -20,17 +20,22 @@ from flangeye.estimation.answers import (
     moves,
     predicted_work,
 )
-from flangeye.estimation.certified import answer_of, certificate_notes, moved_note, verdict_of
-from flangeye.estimation.corrections import CORRECTED, corrected_part, corrections_of
+from flangeye.estimation.answers.corrections import CORRECTED, corrected_part, corrections_of
+from flangeye.estimation.answers.work import Work, work_of
+from flangeye.estimation.certify.certified import (
+    answer_of,
+    certificate_notes,
+    moved_note,
+    verdict_of,
+)
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import marginal
 from flangeye.estimation.observability import symmetry_moves, unobservable
-from flangeye.estimation.session import ModelOptions, Session, session_of
-from flangeye.estimation.sightings import roll_note
-from flangeye.estimation.threads import on_one_thread
-from flangeye.estimation.work import Work, work_of
+from flangeye.estimation.session.session import ModelOptions, Session, session_of
+from flangeye.estimation.start.sightings import roll_note
+from flangeye.maths.threads import on_one_thread
 from flangeye.models.cell import Cell
 from flangeye.models.configuration import mapped_and_expected
 from flangeye.models.scanners import ScannerModel

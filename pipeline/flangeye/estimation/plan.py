@@ -23,11 +23,11 @@ from flangeye.estimation.estimate import Estimate, judged, model_at
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, marginal
 from flangeye.estimation.observability import unobservable
-from flangeye.estimation.session import ModelOptions, effects_of
-from flangeye.estimation.sightings import problem_of
-from flangeye.estimation.start import agreeing, initial_guess
-from flangeye.estimation.threads import on_one_thread
+from flangeye.estimation.session.session import ModelOptions, effects_of
+from flangeye.estimation.start.loops import agreeing, initial_guess
+from flangeye.estimation.start.sightings import problem_of
 from flangeye.maths.statistics import largest_error_quantile
+from flangeye.maths.threads import on_one_thread
 from flangeye.models.cell import Cell, composed
 from flangeye.types import (
     CAMERA,

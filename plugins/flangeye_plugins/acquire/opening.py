@@ -270,7 +270,7 @@ def _require_kinds(root: Path, recordings: Sequence[Recording], cell: Cell) -> N
 
 def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell: Cell) -> None:
     """Refuse joint angles that contradict an arm's poses, and a link's pose without joints."""
-    from flangeye.estimation.sightings import REACHED
+    from flangeye.estimation.start.sightings import REACHED
     from flangeye.maths.kinematics import Arm
 
     arm, told = Arm(cell.arms[name]), [r for r in recordings if name in r.arm_joints]
@@ -298,7 +298,7 @@ def _require_joints(root: Path, recordings: Sequence[Recording], name: str, cell
 
 def _cure(arm: Arm, joints: Floats, pose: Floats) -> str:
     """Return a hint that would make joints and pose of an arm agree."""
-    from flangeye.estimation.sightings import REACHED
+    from flangeye.estimation.start.sightings import REACHED
 
     cures = {
         "write joint_unit: deg": (np.radians(joints), pose),

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.estimation.closed.comanipulation import alternate
-from flangeye.estimation.closed.linear import entries, least_squares
+from flangeye.estimation.start.loops import entries, least_squares
 from flangeye.types import Floats, Mask
 from flangeye.types.geometry import each_applied, invert, nearest_rotation
 from flangeye.workflow.doctor.diagnosis import RecordedSession

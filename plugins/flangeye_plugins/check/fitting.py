@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.estimation.readings import Pairs, estimated
+from flangeye.estimation.session.readings import Pairs, estimated
 from flangeye.types import Floats, Indices, Mask
 from flangeye.types.geometry import each_applied, hat, rotation_exp, rotation_log
 from flangeye.workflow.doctor.diagnosis import Arms, Finding, Misfit, RecordedSession

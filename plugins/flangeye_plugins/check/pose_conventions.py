@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from flangeye import StageError, part
-from flangeye.estimation.readings import Reading, likely, optical, other_axes
+from flangeye.estimation.session.readings import Reading, likely, optical, other_axes
 from flangeye.maths.pose_corrections import inverted, reread, scaled, transposed
 from flangeye.types.pose_formats import (
     EULER_ORDERS,

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flangeye import BoundPart, Choose, Params, StageError, part
-from flangeye.estimation.readings import Axes, optical
+from flangeye.estimation.session.readings import Axes, optical
 from flangeye.files.recording import Archive, Recording
 from flangeye.maths.pose_corrections import (
     delayed,

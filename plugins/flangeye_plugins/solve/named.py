@@ -8,8 +8,15 @@ from flangeye import CalibrationRefused, StageError, stage
 from flangeye.estimation.calibrate import Options, calibrate_at
 from flangeye.estimation.closed.at_once import daniilidis, li, shah
 from flangeye.estimation.closed.comanipulation import FEWEST_KRONECKER, kronecker, two_steps
-from flangeye.estimation.closed.motions import Motions, motions_of, place_of
-from flangeye.estimation.closed.separable import andreff, horaud_dornaika, park_martin, tsai_lenz
+from flangeye.estimation.closed.motions import (
+    Motions,
+    andreff,
+    horaud_dornaika,
+    motions_of,
+    park_martin,
+    place_of,
+    tsai_lenz,
+)
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.observability import (
     FINEST_NOISE,
@@ -24,8 +31,8 @@ from flangeye.estimation.observability import (
     require_turns,
     robust_sigma,
 )
-from flangeye.estimation.sightings import problem_of
-from flangeye.estimation.start import loop_of, start_of_circles
+from flangeye.estimation.start.loops import loop_of, start_of_circles
+from flangeye.estimation.start.sightings import problem_of
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration

@@ -102,7 +102,7 @@ def solve_cell(
 
 def _options(params: RobustParams, workspace: Box | None) -> Options:
     from flangeye.estimation.calibrate import Options
-    from flangeye.estimation.session import ModelOptions
+    from flangeye.estimation.session.session import ModelOptions
 
     return Options(
         params.limits,

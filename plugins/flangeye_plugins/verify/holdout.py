@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import CalibrationRefused, Params, StageError, stage
-from flangeye.estimation.readings import Pairs, Reading, likely, other_axes
+from flangeye.estimation.session.readings import Pairs, Reading, likely, other_axes
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import CELL, DEFAULT, EVERY, Configuration, mapped_and_expected
 from flangeye.models.robots import RobotModel, SecondRobot

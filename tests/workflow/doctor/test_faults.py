@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.estimation.readings import Reading
+from flangeye.estimation.session.readings import Reading
 from flangeye.maths.pose_corrections import (
     delayed,
     inverted,

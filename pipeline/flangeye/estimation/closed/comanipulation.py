@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import CalibrationRefused
-from flangeye.estimation.closed.motions import motions_of, place_of
-from flangeye.estimation.closed.separable import park_martin
+from flangeye.estimation.closed.motions import motions_of, park_martin, place_of
 from flangeye.types import Floats
 from flangeye.types.geometry import (
     invert,

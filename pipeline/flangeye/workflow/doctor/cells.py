@@ -20,7 +20,7 @@ import numpy as np
 
 from flangeye.errors import FlangeyeError, StageError
 from flangeye.estimation.plan import preview
-from flangeye.estimation.sightings import problem_of
+from flangeye.estimation.start.sightings import problem_of
 from flangeye.files.recording import Archive, Recording
 from flangeye.files.yaml_lines import dumped, parse_yaml
 from flangeye.models.cell import Axis, Cell, Link

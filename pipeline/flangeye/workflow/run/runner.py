@@ -217,7 +217,7 @@ class Runner:
 
         Those still undecided after the last capture are rejected.
         """
-        from flangeye.estimation.ambiguity import ambiguous, disambiguated
+        from flangeye.estimation.start.ambiguity import ambiguous, disambiguated
 
         if not self._held:
             return

@@ -26,11 +26,11 @@ from flangeye.estimation.observability import (
     require_turns,
     spread_of,
 )
-from flangeye.estimation.sightings import branches_of, problem_of
-from flangeye.estimation.start import agreeing, distances, initial_guess, size_of
-from flangeye.estimation.threads import on_one_thread
+from flangeye.estimation.start.loops import agreeing, distances, initial_guess, size_of
+from flangeye.estimation.start.sightings import branches_of, problem_of
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import MISFIT, chi2_quantile
+from flangeye.maths.threads import on_one_thread
 from flangeye.models.cell import Cell
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask, Note, Observation, PoseFeature, Warn

@@ -1,9 +1,9 @@
 """Certify that a calibration is the global optimum, for any graph of frames.
 
 A sighting is an equation ``C M = T``, with C the places from a root to the camera and T those to
-the target. A certificate (:mod:`flangeye.estimation.certificate`) takes at most two unknown places
-on either side. Any frame may be the root: the places on the way to it are then replaced by their
-inverses. The root with the smallest certificate is taken.
+the target. A certificate (:mod:`flangeye.estimation.certify.certificate`) takes at most two unknown
+places on either side. Any frame may be the root: the places on the way to it are then replaced by
+their inverses. The root with the smallest certificate is taken.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.estimation.certificate import Certificate, certify
+from flangeye.estimation.certify.certificate import Certificate, certify
+from flangeye.estimation.certify.lifted import Factors, LiftedSightings, families_of
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.lifted import Factors, LiftedSightings, families_of
 from flangeye.models.cell import Frame, chain
 from flangeye.types import Floats, Indices
 from flangeye.types.geometry import invert, rotation_exp, rotation_log

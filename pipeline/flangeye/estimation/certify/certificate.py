@@ -1,9 +1,9 @@
 r"""Certify a local minimum as the global one. Arrays only.
 
 Squared errors are a quadratic form ``r' Q r`` in features ``r`` of the unknown places
-(:mod:`flangeye.estimation.lifted`). Other quadratic forms vanish for all places, because rotation
-matrices are orthonormal and a product of features may be written in several ways. If one of these,
-C, makes
+(:mod:`flangeye.estimation.certify.lifted`). Other quadratic forms vanish for all places, because
+rotation matrices are orthonormal and a product of features may be written in several ways. If one
+of these, C, makes
 
     L = Q - C - f E   positive semidefinite,
 
@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.estimation.lifted import LiftedSightings, Pattern, Quadratic, squares_of
+from flangeye.estimation.certify.lifted import LiftedSightings, Pattern, Quadratic, squares_of
 from flangeye.types import Floats, Indices
 from flangeye.types.geometry import nearest_rotation, rotation_exp
 

@@ -22,10 +22,10 @@ from typing import Literal
 
 import numpy as np
 
+from flangeye.estimation.answers.work import Work
 from flangeye.estimation.estimate import Estimate, model_at
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.estimation.mixed import shares, spread_of
-from flangeye.estimation.work import Work
 from flangeye.models.cell import chain, composed
 from flangeye.types import ExpectedError, Floats
 from flangeye.types.geometry import hat, invert

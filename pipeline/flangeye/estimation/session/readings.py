@@ -21,7 +21,7 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.estimate import Estimate
-from flangeye.estimation.session import session_of
+from flangeye.estimation.session.session import session_of
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import Configuration
 from flangeye.models.robots import RobotModel

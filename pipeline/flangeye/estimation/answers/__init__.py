@@ -1,0 +1,1 @@
+"""What a calibration answers: places, expected error at the work, corrections of an arm."""

@@ -1,0 +1,1 @@
+"""Certificates that an answer is globally optimal."""

@@ -1,0 +1,1 @@
+"""Where an estimate begins: sightings of the observations, and places by closed forms."""
