@@ -11,52 +11,9 @@ from flangeye_paper import fig9, fig10, fig11, fig13, heldout, table1, table2
 from flangeye_paper.tables import read_csv
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
-
-Batches = Annotated[Path, typer.Argument(help="Folder of the study's batches.")]
-Archive = Annotated[Path, typer.Option(help="The authors' published folder.")]
-Out = Annotated[Path, typer.Option(help="Folder for CSV files and pictures.")]
-
-
-@app.command("fig9")
-def _fig9(batches: Batches, out: Out = Path()) -> None:
-    """Error by noise, simulated."""
-    fig9.fig9(batches, out)
-
-
-@app.command("fig10")
-def _fig10(batches: Batches, out: Out = Path()) -> None:
-    """Error by the number of poses, simulated."""
-    fig10.fig10(batches, out)
-
-
-@app.command("table1")
-def _table1(batches: Batches, out: Out = Path()) -> None:
-    """Errors from all poses, published recordings; with the Kinect's."""
-    table1.table1(batches, out)
-
-
-@app.command("table2")
-def _table2(batches: Batches, out: Out = Path()) -> None:
-    """A sphere beside the flange, simulated."""
-    table2.table2(batches, out)
-
-
-@app.command("fig11")
-def _fig11(batches: Batches, archive: Archive, out: Out = Path()) -> None:
-    """Error by the number of poses, published recordings."""
-    fig11.fig11(batches, archive, out)
-
-
-@app.command("fig13")
-def _fig13(batches: Batches, out: Out = Path()) -> None:
-    """Paths of a weld, and the torch's distance from the true seam, simulated."""
-    fig13.fig13(batches, out)
-
-
-@app.command("heldout")
-def _heldout(batches: Batches, archive: Archive, out: Out = Path()) -> None:
-    """Errors on poses that took no part, published recordings."""
-    heldout.heldout(batches, archive, out)
+for study in (fig9, fig10, table1, table2, fig11, fig13, heldout):
+    name = study.__name__.rpartition(".")[2]
+    app.command(name, help=study.__doc__)(getattr(study, name))
 
 
 @app.command("page")

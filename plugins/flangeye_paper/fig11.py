@@ -8,17 +8,8 @@ import numpy as np
 
 from flangeye.files.arrays import read_npz
 from flangeye.types import Floats
+from flangeye_paper import tables
 from flangeye_paper.published import stored_file
-from flangeye_paper.tables import (
-    AXIS_COLOURS,
-    Row,
-    columns,
-    dress,
-    legend,
-    read_sessions,
-    sheet,
-    write_csv,
-)
 
 ROBOTS = {"aubo": "Aubo i5", "ur5": "UR5", "franka": "Franka"}
 
@@ -37,7 +28,7 @@ class Runs(NamedTuple):
     others_rms: Floats | None = None
 
 
-def fig11(batches: Path, archive: Path, out: Path) -> None:
+def fig11(batches: tables.Batches, archive: tables.Archive, out: tables.Out = Path()) -> None:
     """Write fig11.csv, fig11_summary.csv and fig11.png.
 
     Args:
@@ -48,8 +39,10 @@ def fig11(batches: Path, archive: Path, out: Path) -> None:
     runs = {("aubo", "run again"): rerun(batches / "fig11_aubo")}
     runs |= {(robot, "stored"): stored(archive, robot) for robot in ROBOTS}
     rows = [row for (robot, source), many in runs.items() for row in _rows(robot, source, many)]
-    write_csv(out / "fig11.csv", rows)
-    write_csv(out / "fig11_summary.csv", [_summary(*key, many) for key, many in runs.items()])
+    tables.write_csv(out / "fig11.csv", rows)
+    tables.write_csv(
+        out / "fig11_summary.csv", [_summary(*key, many) for key, many in runs.items()]
+    )
     _draw(runs).save(out / "fig11.png")
 
 
@@ -64,42 +57,36 @@ def stored(archive: Path, robot: str) -> Runs:
 
 def rerun(batch: Path) -> Runs:
     """Return the runs of a batch of verify.algorithm_1_by_iteration."""
-    sessions = [s for s in read_sessions(batch) if s.accepted]
+    sessions = [s for s in tables.read_sessions(batch) if s.accepted]
     found = [s.figures("verify.algorithm_1_by_iteration") for s in sessions]
     poses = sorted({int(name[2:]) for name in found[0] if name.startswith("x_")})
-    scale = [1e3] * 3 + [float(np.degrees(1.0))] * 3
-    errors = [
-        [
-            [
-                f.get(f"{axis}_{n:02d}", np.nan) * k
-                for axis, k in zip(AXIS_COLOURS, scale, strict=True)
-            ]
-            for n in poses
-        ]
-        for f in found
-    ]
-    return Runs(poses, np.array(errors), np.array([f["others_rms"] * 1e3 for f in found]))
+    names = [[f"{axis}_{n:02d}" for axis in tables.AXIS_COLOURS] for n in poses]
+    errors = np.array([[[f.get(name, np.nan) for name in row] for row in names] for f in found])
+    errors = np.concatenate([1e3 * errors[..., :3], np.degrees(errors[..., 3:])], axis=2)
+    return Runs(poses, errors, np.array([f["others_rms"] * 1e3 for f in found]))
 
 
-def _rows(robot: str, source: str, runs: Runs) -> list[Row]:
+def _rows(robot: str, source: str, runs: Runs) -> list[tables.Row]:
     means, deviations = np.nanmean(runs.errors, axis=0), np.nanstd(runs.errors, axis=0)
     return [
         {
             "robot": robot,
             "source": source,
             "poses": n,
-            **{f"{axis}_mean": float(means[k, i]) for i, axis in enumerate(AXIS_COLOURS)},
-            **{f"{axis}_std": float(deviations[k, i]) for i, axis in enumerate(AXIS_COLOURS)},
+            **{f"{axis}_mean": float(means[k, i]) for i, axis in enumerate(tables.AXIS_COLOURS)},
+            **{
+                f"{axis}_std": float(deviations[k, i]) for i, axis in enumerate(tables.AXIS_COLOURS)
+            },
         }
         for k, n in enumerate(runs.poses)
     ]
 
 
-def _summary(robot: str, source: str, runs: Runs) -> Row:
+def _summary(robot: str, source: str, runs: Runs) -> tables.Row:
     """Return a summary of the final results of all runs."""
     last = runs.errors[:, -1]
     norms = np.linalg.norm(last[:, :3], axis=1)
-    deviations = last.std(axis=0)
+    told = [f"{m:+.2f} ± {s:.2f}" for m, s in zip(last.mean(axis=0), last.std(axis=0), strict=True)]
     return {
         "recording": f"{ROBOTS[robot]}, {source}",
         "runs": len(norms),
@@ -107,38 +94,38 @@ def _summary(robot: str, source: str, runs: Runs) -> Row:
         "the paper": "< 0.4 mm, 0.6 deg" if robot == "franka" else "< 0.28 mm, 0.25 deg",
         "translation mean mm": float(norms.mean()),
         "worst mm": float(norms.max()),
-        **{
-            f"{axis} {'mm' if i < 3 else 'deg'}": f"{last[:, i].mean():+.2f} ± {deviations[i]:.2f}"
-            for i, axis in enumerate(AXIS_COLOURS)
-        },
+        **tables.with_units(told),
     }
 
 
 def _draw(runs: Mapping[tuple[str, str], Runs]) -> Any:
-    page = sheet(2, 3, 10.5, 6.0)
+    page = tables.sheet(2, 3, 10.5, 6.0)
     for column, robot in enumerate(ROBOTS):
-        for row, axes, unit in ((0, [*AXIS_COLOURS][:3], "mm"), (1, [*AXIS_COLOURS][3:], "deg")):
+        for row, axes, unit in (
+            (0, [*tables.AXIS_COLOURS][:3], "mm"),
+            (1, [*tables.AXIS_COLOURS][3:], "deg"),
+        ):
             panel = page.panels[3 * row + column]
             _spread(panel, _rows(robot, "stored", runs[robot, "stored"]), axes, filled=True)
             if (robot, "run again") in runs:
                 again = _rows(robot, "run again", runs[robot, "run again"])
                 _spread(panel, again, axes, filled=False)
             what = "stored (bands) and run again (lines)" if column == 0 else "stored"
-            dress(panel, f"{ROBOTS[robot]}, {what}", "poses", f"mean ± deviation [{unit}]")
+            tables.dress(panel, f"{ROBOTS[robot]}, {what}", "poses", f"mean ± deviation [{unit}]")
             panel.set_xlim(5, 45)
             panel.set_ylim((-2, 2) if row == 0 else (-0.7, 0.7))
             if column == 2:
-                legend(panel, loc="upper right", ncols=3)
+                tables.legend(panel, loc="upper right", ncols=3)
     return page
 
 
-def _spread(panel: Any, rows: Sequence[Row], axes: Sequence[str], filled: bool) -> None:
+def _spread(panel: Any, rows: Sequence[tables.Row], axes: Sequence[str], filled: bool) -> None:
     """Draw mean and standard deviation of each axis as a band, or as its two edges."""
     for axis in axes:
         poses, mean, deviation = map(
-            np.array, columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
+            np.array, tables.columns(rows, "poses", f"{axis}_mean", f"{axis}_std")
         )
-        low, high, colour = mean - deviation, mean + deviation, AXIS_COLOURS[axis]
+        low, high, colour = mean - deviation, mean + deviation, tables.AXIS_COLOURS[axis]
         if filled:
             panel.plot(poses, mean, color=colour, linewidth=1.0, label=axis)
             panel.fill_between(poses, low, high, color=colour, alpha=0.2, lw=0)

@@ -12,7 +12,7 @@ from flangeye.maths.seam_geometry import WeldPlane, torch_deviation
 from flangeye.types import Floats, WeldReport, WorkpieceScan
 from flangeye.types.geometry import arc_lengths
 from flangeye.workflow.log.read import read_run
-from flangeye_paper.tables import Row, SessionRow, dress, legend, read_sessions, sheet, write_csv
+from flangeye_paper import tables
 
 WORKPIECES = ("straight", "curved")
 FOLLOWED = {
@@ -86,7 +86,7 @@ class SeenWeld:
         return plane.beside(self.truth, points)
 
 
-def seen(session: SessionRow) -> SeenWeld:
+def seen(session: tables.SessionRow) -> SeenWeld:
     """Return the weld of a session.
 
     Raises:
@@ -104,7 +104,7 @@ Welds = Mapping[str, Sequence[SeenWeld]]
 """Welds by the method that followed the seam."""
 
 
-def fig13(batches: Path, out: Path) -> None:
+def fig13(batches: tables.Batches, out: tables.Out = Path()) -> None:
     """Write fig13.csv and fig13.png.
 
     Args:
@@ -112,30 +112,32 @@ def fig13(batches: Path, out: Path) -> None:
         out: Folder for the files.
     """
     welds = {name: _welds(batches, name) for name in WORKPIECES}
-    write_csv(out / "fig13.csv", [row for name in WORKPIECES for row in _rows(name, welds[name])])
+    tables.write_csv(
+        out / "fig13.csv", [row for name in WORKPIECES for row in _rows(name, welds[name])]
+    )
     _draw(welds).save(out / "fig13.png")
 
 
 def _welds(batches: Path, workpiece: str) -> Welds:
     """Return the welds of a workpiece by the method that followed the seam."""
-    others = read_sessions(batches / f"fig13-others_{workpiece}")
+    others = tables.read_sessions(batches / f"fig13-others_{workpiece}")
     mode = "steps.5.mode"
     sessions = {
-        "touch": read_sessions(batches / f"fig13_{workpiece}"),
+        "touch": tables.read_sessions(batches / f"fig13_{workpiece}"),
         "plan": [s for s in others if s.row[mode] == "vision"],
         "printed": [s for s in others if s.row[mode] == "as_printed"],
-        "across": read_sessions(batches / f"fig13-across_{workpiece}"),
-        "bridged": read_sessions(batches / f"fig13-gap_{workpiece}"),
+        "across": tables.read_sessions(batches / f"fig13-across_{workpiece}"),
+        "bridged": tables.read_sessions(batches / f"fig13-gap_{workpiece}"),
     }
     return {name: [seen(session) for session in listed] for name, listed in sessions.items()}
 
 
-def _rows(workpiece: str, welds: Welds) -> Iterable[Row]:
+def _rows(workpiece: str, welds: Welds) -> Iterable[tables.Row]:
     for name, listed in welds.items():
         yield {"workpiece": workpiece, "followed": FOLLOWED[name], **_figures(name, listed)}
 
 
-def _figures(name: str, welds: Sequence[SeenWeld]) -> Row:
+def _figures(name: str, welds: Sequence[SeenWeld]) -> tables.Row:
     """Return the figures over all welds that were followed in one way."""
     # By arc length [m]: after four tool lengths; in the gap
     part = {"across": (0.16, np.inf), "bridged": (0.09, 0.11)}.get(name, (0.0, np.inf))
@@ -164,12 +166,12 @@ def _mm(metres: float) -> str:
 
 def _draw(welds: Mapping[str, Welds]) -> Any:
     """Draw the paths in the plane, and the torch's distance from the true seam, by workpiece."""
-    page = sheet(2, 2, 9.0, 5.4)
+    page = tables.sheet(2, 2, 9.0, 5.4)
     for column, workpiece in enumerate(WORKPIECES):
         _paths(page.panels[column], workpiece, welds[workpiece]["touch"][0])
         _distance(page.panels[2 + column], welds[workpiece])
-    legend(page.panels[0], loc="lower right", ncols=2)
-    legend(page.panels[2], loc="upper right")
+    tables.legend(page.panels[0], loc="lower right", ncols=2)
+    tables.legend(page.panels[2], loc="upper right")
     return page
 
 
@@ -181,7 +183,7 @@ def _paths(panel: Any, workpiece: str, weld: SeenWeld) -> None:
     for name, colour in (("robot", "#d97706"), ("tip", "#1d4ed8"), ("torch", "#be123c")):
         at = flat(getattr(report, name)) * 1e3
         panel.plot(*at.T, color=colour, linewidth=1.0, label=name)
-    dress(panel, f"paths, {workpiece} groove", "along [mm]", "across [mm]")
+    tables.dress(panel, f"paths, {workpiece} groove", "along [mm]", "across [mm]")
 
 
 def _distance(panel: Any, welds: Welds) -> None:
@@ -193,4 +195,4 @@ def _distance(panel: Any, welds: Welds) -> None:
             panel.plot(at, off, color=colour, linewidth=0.8, label=None if i else FOLLOWED[name])
     panel.set_yscale("log")
     panel.set_ylim(1e-3, 1e2)
-    dress(panel, "torch from the true seam", "along [mm]", "distance [mm]")
+    tables.dress(panel, "torch from the true seam", "along [mm]", "distance [mm]")

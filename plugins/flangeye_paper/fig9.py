@@ -7,25 +7,10 @@ from typing import Any
 import numpy as np
 
 from flangeye.maths.statistics import rms
-from flangeye_paper.tables import (
-    AXIS_COLOURS,
-    BOUND,
-    GROWTH,
-    METHOD_LOOKS,
-    PRINTED,
-    Row,
-    SessionRow,
-    columns,
-    dress,
-    legend,
-    logarithmic,
-    read_sessions,
-    sheet,
-    write_csv,
-)
+from flangeye_paper import tables
 
 
-def fig9(batches: Path, out: Path) -> None:
+def fig9(batches: tables.Batches, out: tables.Out = Path()) -> None:
     """Write fig9.csv, fig9_summary.csv, fig9_pools.csv and fig9.png.
 
     Args:
@@ -35,25 +20,29 @@ def fig9(batches: Path, out: Path) -> None:
     rows = [
         {"method": method, "outliers": share, **realised(session)}
         for share, prefix in ((0.0, "fig9"), (0.15, "fig9-outliers"))
-        for method in METHOD_LOOKS
-        for session in read_sessions(batches / f"{prefix}_{method}")
+        for method in tables.METHOD_LOOKS
+        for session in tables.read_sessions(batches / f"{prefix}_{method}")
     ]
-    write_csv(out / "fig9.csv", rows)
-    write_csv(out / "fig9_summary.csv", [_summary(rows, method) for method in METHOD_LOOKS])
-    write_csv(out / "fig9_pools.csv", [_pool(s) for s in read_sessions(batches / "fig9-pools")])
+    tables.write_csv(out / "fig9.csv", rows)
+    tables.write_csv(
+        out / "fig9_summary.csv", [_summary(rows, method) for method in tables.METHOD_LOOKS]
+    )
+    tables.write_csv(
+        out / "fig9_pools.csv", [_pool(s) for s in tables.read_sessions(batches / "fig9-pools")]
+    )
     _draw(rows).save(out / "fig9.png")
 
 
-def realised(session: SessionRow) -> dict[str, Any]:
+def realised(session: tables.SessionRow) -> dict[str, Any]:
     """Return a session's figures in millimetres and degrees, as its row of the CSV."""
     found = session.figures("verify.realisations")
-    scale = {axis: 1e3 if len(axis) == 1 else np.degrees(1.0) for axis in AXIS_COLOURS}
+    scale = {axis: 1e3 if len(axis) == 1 else np.degrees(1.0) for axis in tables.AXIS_COLOURS}
     noise = session.row.get("steps.0.noise")
     return {
         "noise_mm": session.number("steps.0.noise") if noise else 1.0,
-        **{f"{axis}_std": found[f"{axis}_std"] * scale[axis] for axis in AXIS_COLOURS},
-        **{f"{axis}_mean": found[f"{axis}_mean"] * scale[axis] for axis in AXIS_COLOURS},
-        **{f"{axis}_bound": found[f"bound_{axis}"] * scale[axis] for axis in AXIS_COLOURS},
+        **{f"{axis}_std": found[f"{axis}_std"] * scale[axis] for axis in tables.AXIS_COLOURS},
+        **{f"{axis}_mean": found[f"{axis}_mean"] * scale[axis] for axis in tables.AXIS_COLOURS},
+        **{f"{axis}_bound": found[f"bound_{axis}"] * scale[axis] for axis in tables.AXIS_COLOURS},
         "centre_x_std": found["centre_x_std"] * 1e3,
         "centre_y_std": found["centre_y_std"] * 1e3,
         "workspace_rms": found["workspace_rms"] * 1e3,
@@ -64,7 +53,7 @@ def realised(session: SessionRow) -> dict[str, Any]:
     }
 
 
-def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
+def _summary(rows: Sequence[tables.Row], method: str) -> dict[str, Any]:
     """Return each error's slope over the noise, and its change with outliers, of a method."""
     clean = [r for r in rows if r["method"] == method and r["outliers"] == 0]
     gross = [r for r in rows if r["method"] == method and r["outliers"] > 0]
@@ -72,8 +61,8 @@ def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
     alone = [r["workspace_rms"] / r["inliers_alone_rms"] for r in gross]
     at_one = [r["workspace_rms"] for r in gross if r["noise_mm"] == 1]
     return {
-        "method": METHOD_LOOKS[method].label,
-        **{f"{axis} {_unit(axis)}": _growth(clean, f"{axis}_std") for axis in AXIS_COLOURS},
+        "method": tables.METHOD_LOOKS[method].label,
+        **{f"{axis} {_unit(axis)}": _growth(clean, f"{axis}_std") for axis in tables.AXIS_COLOURS},
         "x at work mm/mm": _growth(clean, "centre_x_std"),
         "workspace rms mm/mm": _growth(clean, "workspace_rms"),
         "times the bound": rms(over),
@@ -82,7 +71,7 @@ def _summary(rows: Sequence[Row], method: str) -> dict[str, Any]:
     }
 
 
-def _pool(session: SessionRow) -> dict[str, Any]:
+def _pool(session: tables.SessionRow) -> dict[str, Any]:
     """Return a text that compares a pool of this size with the paper's claim of one seventh."""
     row = realised(session)
     return {
@@ -99,12 +88,12 @@ def _unit(axis: str) -> str:
     return "mm/mm" if len(axis) == 1 else "deg/mm"
 
 
-def _growth(rows: Sequence[Row], column: str) -> float:
+def _growth(rows: Sequence[tables.Row], column: str) -> float:
     return rms([r[column] / r["noise_mm"] for r in rows])
 
 
-def _draw(rows: Sequence[Row]) -> Any:
-    page = sheet(2, 3, 10.5, 6.0)
+def _draw(rows: Sequence[tables.Row]) -> Any:
+    page = tables.sheet(2, 3, 10.5, 6.0)
     clean = [r for r in rows if r["outliers"] == 0]
     gross = [r for r in rows if r["outliers"] > 0]
     printed = (
@@ -115,36 +104,38 @@ def _draw(rows: Sequence[Row]) -> Any:
     )
     for panel, (column, bound, title, unit) in zip(page.panels, printed, strict=False):
         _lines(panel, clean, column, bound)
-        dress(panel, title, "noise [mm]", f"standard deviation [{unit}]")
+        tables.dress(panel, title, "noise [mm]", f"standard deviation [{unit}]")
     page.panels[3].set_ylabel("error [mm]", fontsize=8)
-    logarithmic(page.panels[0], 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
+    tables.logarithmic(page.panels[0], 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20)
     noise, all_data = _of(clean, "all-data", "noise_mm", "x_bound")
-    page.panels[0].plot(noise, np.array(all_data) * GROWTH, ":", color=PRINTED.colour)
+    page.panels[0].plot(noise, np.array(all_data) * tables.GROWTH, ":", color=tables.PRINTED.colour)
     page.panels[0].annotate(
-        "one seventh, says the paper", (10, all_data[-1] * GROWTH), fontsize=7, ha="right",
-        xytext=(0, -32), textcoords="offset points", color=PRINTED.colour,
+        "one seventh, says the paper", (10, all_data[-1] * tables.GROWTH), fontsize=7, ha="right",
+        xytext=(0, -32), textcoords="offset points", color=tables.PRINTED.colour,
     )  # fmt: skip
     _lines(page.panels[4], gross, "workspace_rms", "workspace_bound")
-    logarithmic(page.panels[4], 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50)
-    dress(page.panels[4], "the same with 15 % gross outliers", "noise [mm]", "error [mm]")
+    tables.logarithmic(page.panels[4], 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50)
+    tables.dress(page.panels[4], "the same with 15 % gross outliers", "noise [mm]", "error [mm]")
     _key(page.panels[5])
     return page
 
 
-def _lines(panel: Any, rows: Sequence[Row], column: str, bound: str) -> None:
-    for method, look in METHOD_LOOKS.items():
+def _lines(panel: Any, rows: Sequence[tables.Row], column: str, bound: str) -> None:
+    for method, look in tables.METHOD_LOOKS.items():
         panel.plot(*_of(rows, method, "noise_mm", column), color=look.colour, linewidth=1.4)
-    panel.plot(*_of(rows, "all-data", "noise_mm", bound), "--", color=BOUND.colour, linewidth=1.0)
+    panel.plot(
+        *_of(rows, "all-data", "noise_mm", bound), "--", color=tables.BOUND.colour, linewidth=1.0
+    )
 
 
-def _of(rows: Sequence[Row], method: str, *names: str) -> list[list[float]]:
-    return columns((r for r in rows if r["method"] == method), *names)
+def _of(rows: Sequence[tables.Row], method: str, *names: str) -> list[list[float]]:
+    return tables.columns((r for r in rows if r["method"] == method), *names)
 
 
 def _key(panel: Any) -> None:
     """Turn the last panel into the legend of all."""
-    for look in METHOD_LOOKS.values():
+    for look in tables.METHOD_LOOKS.values():
         panel.plot([], [], color=look.colour, linewidth=2, label=look.label)
-    panel.plot([], [], "--", color=BOUND.colour, label=BOUND.label)
+    panel.plot([], [], "--", color=tables.BOUND.colour, label=tables.BOUND.label)
     panel.set_axis_off()
-    legend(panel, loc="center left")
+    tables.legend(panel, loc="center left")

@@ -8,27 +8,16 @@ import numpy as np
 
 from flangeye import FlangeyeError
 from flangeye.maths.statistics import rms
+from flangeye_paper import tables
 from flangeye_paper.published import stored_results
-from flangeye_paper.tables import (
-    METHOD_LOOKS,
-    PlotStyle,
-    Row,
-    SessionRow,
-    dress,
-    legend,
-    logarithmic,
-    read_sessions,
-    sheet,
-    write_csv,
-)
 
 STAGE = "verify.holdout"
 
-HELD_OUT_METHODS: Mapping[str, PlotStyle] = {
-    "all-data": METHOD_LOOKS["all-data"],
-    "algorithm-1": METHOD_LOOKS["algorithm-1-held-out"],
-    "robust": METHOD_LOOKS["robust"],
-    "robust-joints": PlotStyle("solve.robust with joint offsets", "#0e7490"),
+HELD_OUT_METHODS: Mapping[str, tables.PlotStyle] = {
+    "all-data": tables.METHOD_LOOKS["all-data"],
+    "algorithm-1": tables.METHOD_LOOKS["algorithm-1-held-out"],
+    "robust": tables.METHOD_LOOKS["robust"],
+    "robust-joints": tables.PlotStyle("solve.robust with joint offsets", "#0e7490"),
 }
 
 
@@ -53,7 +42,7 @@ RECORDINGS: Mapping[str, CentreSet] = {
 """Published centres by the name of the archive's last folder or file."""
 
 
-def heldout(batches: Path, archive: Path, out: Path) -> None:
+def heldout(batches: tables.Batches, archive: tables.Archive, out: tables.Out = Path()) -> None:
     """Write heldout.csv and heldout.png.
 
     Poses that solve.robust sets aside when it sees them all are left out of ``rms`` for every
@@ -65,7 +54,7 @@ def heldout(batches: Path, archive: Path, out: Path) -> None:
         out: Folder for the file.
     """
     found = {method: _by_recording(batches, method) for method in HELD_OUT_METHODS}
-    rows: list[Row] = []
+    rows: list[tables.Row] = []
     for key, recording in RECORDINGS.items():
         observations = found["robust"][key][0].result()["observations"]
         kept = {o["id"] for o in observations if o["used"]}
@@ -74,13 +63,13 @@ def heldout(batches: Path, archive: Path, out: Path) -> None:
                 rows.append(_row(recording, look.label, found[method][key], kept))
         if recording.stored:
             rows.append(_stored_row(recording, archive, found["robust"][key][0], kept))
-    write_csv(out / "heldout.csv", rows)
+    tables.write_csv(out / "heldout.csv", rows)
     _draw(rows).save(out / "heldout.png")
 
 
-def _by_recording(batches: Path, method: str) -> dict[str, list[SessionRow]]:
+def _by_recording(batches: Path, method: str) -> dict[str, list[tables.SessionRow]]:
     """Return the sessions of a method by recording, one for each split."""
-    found: dict[str, list[SessionRow]] = {}
+    found: dict[str, list[tables.SessionRow]] = {}
     for session in _sessions(batches, method):
         key = Path(session.row["archive"]).name
         if key not in RECORDINGS:
@@ -89,15 +78,15 @@ def _by_recording(batches: Path, method: str) -> dict[str, list[SessionRow]]:
     return found
 
 
-def _sessions(batches: Path, method: str) -> Iterable[SessionRow]:
-    folders = sorted(batches.glob(f"heldout_{method}")) + sorted(
-        batches.glob(f"heldout_{method}_*")
-    )
+def _sessions(batches: Path, method: str) -> Iterable[tables.SessionRow]:
+    folders = [*batches.glob(f"heldout_{method}"), *sorted(batches.glob(f"heldout_{method}_*"))]
     for folder in folders or [batches / f"heldout_{method}"]:
-        yield from (session for session in read_sessions(folder) if session.accepted)
+        yield from (session for session in tables.read_sessions(folder) if session.accepted)
 
 
-def _row(recording: CentreSet, label: str, splits: list[SessionRow], kept: set[str]) -> Row:
+def _row(
+    recording: CentreSet, label: str, splits: list[tables.SessionRow], kept: set[str]
+) -> tables.Row:
     errors = [_errors(session) for session in splits]
     common = [rms([v for k, v in e.items() if k in kept]) for e in errors]
     return {
@@ -113,7 +102,7 @@ def _row(recording: CentreSet, label: str, splits: list[SessionRow], kept: set[s
     }
 
 
-def _errors(session: SessionRow) -> dict[str, float]:
+def _errors(session: tables.SessionRow) -> dict[str, float]:
     """Return the held-out error of each pose [mm]."""
     for label, verification in session.result()["verifications"].items():
         if label.endswith(STAGE):
@@ -121,7 +110,9 @@ def _errors(session: SessionRow) -> dict[str, float]:
     raise FlangeyeError(f"{session.folder}: has no step {STAGE}")
 
 
-def _stored_row(recording: CentreSet, archive: Path, session: SessionRow, kept: set[str]) -> Row:
+def _stored_row(
+    recording: CentreSet, archive: Path, session: tables.SessionRow, kept: set[str]
+) -> tables.Row:
     """Return the errors of the authors' 50 stored answers on all poses, their pools included."""
     matrices, _ = stored_results(archive, recording.stored or "")
     poses = [o for o in session.result()["observations"] if o["centre_in_camera"]]
@@ -144,8 +135,8 @@ def _stored_row(recording: CentreSet, archive: Path, session: SessionRow, kept: 
     }
 
 
-def _draw(rows: list[Row]) -> Any:
-    page = sheet(1, 1, 8.0, 3.4)
+def _draw(rows: list[tables.Row]) -> Any:
+    page = tables.sheet(1, 1, 8.0, 3.4)
     panel = page.panels[0]
     looks = {look.label: look.colour for look in HELD_OUT_METHODS.values()}
     names = [recording.name for recording in RECORDINGS.values()]
@@ -159,9 +150,9 @@ def _draw(rows: list[Row]) -> Any:
             [place], [row["rms mm"]], "o", color=colour, label=label and str(label["method"])
         )
     panel.set_xticks(range(len(names)), names, fontsize=8)
-    dress(panel, "", "", "held-out error, rms [mm]")
-    logarithmic(panel, 0.2, 0.3, 0.5, 1, 2, 5)
-    legend(panel, loc="upper left", bbox_to_anchor=(0.0, 1.32), ncols=2)
+    tables.dress(panel, "", "", "held-out error, rms [mm]")
+    tables.logarithmic(panel, 0.2, 0.3, 0.5, 1, 2, 5)
+    tables.legend(panel, loc="upper left", bbox_to_anchor=(0.0, 1.32), ncols=2)
     return page
 
 

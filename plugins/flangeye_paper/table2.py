@@ -8,19 +8,7 @@ import numpy as np
 
 from flangeye.types import Floats
 from flangeye.types.geometry import rpy_from_rotation
-from flangeye_paper.tables import (
-    AXIS_COLOURS,
-    PRINTED,
-    TABLE_2,
-    Row,
-    SessionRow,
-    dress,
-    legend,
-    logarithmic,
-    read_sessions,
-    sheet,
-    write_csv,
-)
+from flangeye_paper import tables
 
 TARGETS = {"flange": "#1d4ed8", "sphere": "#d97706"}
 
@@ -45,7 +33,7 @@ class Trials(NamedTuple):
     refused: int
 
 
-def table2(batches: Path, out: Path) -> None:
+def table2(batches: tables.Batches, out: tables.Out = Path()) -> None:
     """Write table2.csv and table2.png.
 
     Args:
@@ -54,23 +42,25 @@ def table2(batches: Path, out: Path) -> None:
     """
     trials = []
     for target in TARGETS:
-        wide = read_sessions(batches / f"table2_{target}")
+        wide = tables.read_sessions(batches / f"table2_{target}")
         for counts, pairs in (("[2, 2, 1]", 4), ("[4, 2, 2]", 16)):
             chosen = [s for s in wide if s.row["steps.0.poses.grid.counts"] == counts]
             trials.append(_trials(target, pairs, False, chosen))
-        narrow = read_sessions(batches / f"table2-narrow_{target}")
+        narrow = tables.read_sessions(batches / f"table2-narrow_{target}")
         trials.append(_trials(target, 16, True, narrow))
     printed = [
         {"target": "sphere, Photoneo's software, the paper", "pairs": pairs.split()[0]}
-        | dict(zip(_columns(), (f"{v:+.2f}" for v in values), strict=True))
-        for pairs, values in TABLE_2.items()
+        | tables.with_units(f"{v:+.2f}" for v in values)
+        for pairs, values in tables.TABLE_2.items()
     ]
     rows = [_row(t) for t in trials]
-    write_csv(out / "table2.csv", [*rows, *({**dict.fromkeys(rows[0]), **p} for p in printed)])
+    tables.write_csv(
+        out / "table2.csv", [*rows, *({**dict.fromkeys(rows[0]), **p} for p in printed)]
+    )
     _draw(trials).save(out / "table2.png")
 
 
-def _trials(target: str, pairs: int, narrow: bool, sessions: Sequence[SessionRow]) -> Trials:
+def _trials(target: str, pairs: int, narrow: bool, sessions: Sequence[tables.SessionRow]) -> Trials:
     results = [session.result() for session in sessions if session.accepted]
     errors = [_error(result) for result in results]
     workspace = [result["truth"]["rms_over_workspace"] * 1e3 for result in results]
@@ -85,17 +75,13 @@ def _error(result: dict[str, Any]) -> Floats:
     return np.array([*error[:3, 3] * 1e3, *np.degrees(rpy_from_rotation(error[:3, :3]))])
 
 
-def _columns() -> list[str]:
-    return [f"{axis} {'mm' if len(axis) == 1 else 'deg'}" for axis in AXIS_COLOURS]
-
-
-def _row(trials: Trials) -> Row:
+def _row(trials: Trials) -> tables.Row:
     rms = np.sqrt((trials.errors**2).mean(axis=0))
     return {
         "target": trials.target + (", poses within 60 x 60 x 40 mm" if trials.narrow else ""),
         "pairs": trials.pairs,
         "trials": len(trials.errors),
-        **dict(zip(_columns(), (f"{v:.2f}" for v in rms), strict=True)),
+        **tables.with_units(f"{v:.2f}" for v in rms),
         "worst translation mm": float(np.linalg.norm(trials.errors[:, :3], axis=1).max()),
         "workspace rms mm": float(np.median(trials.workspace)),
         "worst mm": float(trials.workspace.max()),
@@ -103,7 +89,7 @@ def _row(trials: Trials) -> Row:
 
 
 def _draw(trials: Sequence[Trials]) -> Any:
-    page = sheet(1, 2, 9.0, 3.2)
+    page = tables.sheet(1, 2, 9.0, 3.2)
     names = ["4 pairs", "16 pairs", "16 pairs,\nclose together"]
     for kind in trials:
         place = (2 if kind.narrow else [4, 16].index(kind.pairs)) + (
@@ -116,16 +102,20 @@ def _draw(trials: Sequence[Trials]) -> Any:
                 [place] * len(values), values, "o", color=TARGETS[kind.target], alpha=0.5, ms=4,
                 label=label,
             )  # fmt: skip
-    for index, values in enumerate(TABLE_2.values()):
+    for index, values in enumerate(tables.TABLE_2.values()):
         norm = float(np.linalg.norm(values[:3]))
         page.panels[0].plot(
-            [index], [norm], "D", color=PRINTED.colour, label=None if index else "Table 2, a sphere"
+            [index],
+            [norm],
+            "D",
+            color=tables.PRINTED.colour,
+            label=None if index else "Table 2, a sphere",
         )
     titles = ("translation at the camera's origin, as printed", "at the work: over the workspace")
     for panel, title in zip(page.panels, titles, strict=True):
         panel.set_xticks(range(3), names)
         panel.set_xlim(-0.5, 2.5)
-        logarithmic(panel, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
-        dress(panel, title, "", "error [mm]")
-    legend(page.panels[0], loc="upper right")
+        tables.logarithmic(panel, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
+        tables.dress(panel, title, "", "error [mm]")
+    tables.legend(page.panels[0], loc="upper right")
     return page

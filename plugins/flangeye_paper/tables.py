@@ -5,11 +5,17 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
 
 from flangeye import FlangeyeError
 from flangeye.workflow.batch.outcome import ACCEPTED
 
+Batches = Annotated[Path, typer.Argument(help="Folder of the study's batches.")]
+Archive = Annotated[Path, typer.Option(help="The authors' published folder.")]
+Out = Annotated[Path, typer.Option(help="Folder for CSV files and pictures.")]
 Row = Mapping[str, Any]
 
 
@@ -92,6 +98,18 @@ def columns(rows: Iterable[Row], *names: str) -> list[list[float]]:
     """Return named columns of rows as numbers."""
     listed = list(rows)
     return [[float(row[name]) for row in listed] for name in names]
+
+
+def printed_units(values: Mapping[str, float]) -> dict[str, float]:
+    """Return the components of a pose in mm and degrees, from metres and radians."""
+    degrees = float(np.degrees(1.0))
+    return {axis: values[axis] * (1e3 if len(axis) == 1 else degrees) for axis in AXIS_COLOURS}
+
+
+def with_units(values: Iterable[Any]) -> dict[str, Any]:
+    """Return the components of a pose by name and printed unit, as the tables' columns are."""
+    names = (f"{axis} {'mm' if len(axis) == 1 else 'deg'}" for axis in AXIS_COLOURS)
+    return dict(zip(names, values, strict=True))
 
 
 def _text(value: Any) -> str:
