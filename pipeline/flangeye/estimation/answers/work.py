@@ -103,13 +103,17 @@ def _weights(work: Problem, rotations: Floats, boxes: Floats) -> Floats:
         points = centres[:, None] + halves[:, None] * gauss
         means = _products((points - middle) / wide).mean(axis=1)
     # Of both, those with three factors at most
-    some = np.add.outer(_factors().sum(axis=1), _factors().sum(axis=1)) <= 3
+    factors = np.add.outer(_factors().sum(axis=1), _factors().sum(axis=1))
+    some = factors <= 3
     products = (places[:, :, None] * turns[:, None])[:, some]
     off = (means[:, :, None] * every.mean(axis=0))[:, some] - even @ products
     gram = np.swapaxes(products * even[..., None], 1, 2) @ products
-    # Numbers that do not vary have no share, by a ridge far below what the others leave
-    shares = np.linalg.solve(gram + 1e-10 * np.eye(len(gram[0])), off[..., None])
-    return np.asarray(even * (1 + (products @ shares)[..., 0]))
+    # Few sightings in a box cannot have all these means: the more factors, the less of an arm's
+    # error a product is, and the sooner it is given up
+    ridge = 1e-5 * np.diag(10.0 ** factors[some]) / inside.sum(axis=1)[:, None, None]
+    shares = np.linalg.solve(gram + ridge, off[..., None])
+    weights = even * (1 + (products @ shares)[..., 0])
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def _products(numbers: Floats) -> Floats:
