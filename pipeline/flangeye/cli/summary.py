@@ -104,22 +104,23 @@ def print_refusal(
     write(console, wrapped(console, f"What is wrong     {wrong}", 18), "red")
     write(console, wrapped(console, f"How it is known   {known}", 18))
     for name, step in zip(("Next step", joined), next_steps, strict=False):
-        if step.startswith(("- ", "configuration:")):  # of the recipe, to paste as it stands
+        if step.startswith(
+            ("- ", "configuration:", "feature:")
+        ):  # of the recipe, to paste as it stands
             write(console, f"{name:<15}   write in the recipe:\n  {step}")
         else:
             write(console, wrapped(console, f"{name:<15}   {step}", 18))
 
 
 def rows(console: Console, rows: Iterable[tuple[str, str, str]], colour: str = "") -> None:
-    """Print aligned rows: name, value, remark; remarks go below where one is too long."""
+    """Print aligned rows: name, value, remark; a remark too long for its line goes below it."""
     listed = [*rows]
     name_width, value_width = (max((len(row[i]) for row in listed), default=0) for i in (0, 1))
-    longest = max((len(remark) for *_, remark in listed), default=0)
-    beside = name_width + value_width + longest + 6 <= width(console)
     for name, value, remark in listed:
         line = f"{name:<{name_width}}   {value}"
-        if beside:
-            line = f"{line:<{name_width + 3 + value_width}}   {remark}".rstrip()
+        beside = f"{line:<{name_width + 3 + value_width}}   {remark}".rstrip()
+        if len(beside) <= width(console):
+            line = beside
         elif remark:
             line += "\n" + wrapped(console, f"   {remark}", 3)
         write(console, line, colour)

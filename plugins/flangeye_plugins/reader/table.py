@@ -242,7 +242,7 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
     if not any(found) and all(named):
         files_named = bool(PurePath(named[0]).suffix)
         stems = [PurePath(name).stem for name in named]
-        called = replace(poses, names=stems, ranked=not files_named)
+        called = replace(poses, names=stems)
         try:
             return scans_of(folder, called, text.files)
         except StageError:

@@ -123,6 +123,19 @@ def test_clouds_in_another_unit_than_the_recipe_states() -> None:
     assert "unit: auto" in finding.fix
 
 
+@pytest.mark.parametrize("stated", ["ISO 9409-1-80-6-M8", "ISO 9409-1-40-4-M6"])
+def test_another_plate_than_the_recipe_states(stated: str) -> None:
+    path = recipe_names()["ur5_phoxi-m_sample"]
+    recipe = load_recipe(path, REGISTRY, [f"feature.standard={stated}"])
+    (finding,) = examine(
+        open_session(recipe.steps[0].params.path, REGISTRY, recipe), CHECKS
+    ).findings
+    told = f"no scan shows the plate {stated}, 8 of 8 show ISO 9409-1-50-4-M6"
+    assert (finding.name, finding.what) == ("wrong plate", told)
+    assert finding.fix == "feature: {standard: ISO 9409-1-50-4-M6}"
+    assert finding.lines == [{"feature": {"standard": "ISO 9409-1-50-4-M6"}}]
+
+
 def test_clouds_in_inches(tmp_path: Path) -> None:
     """The sample that comes with the project, its clouds written in inches; the line cures."""
     path = recipe_names()["ur5_phoxi-m_sample"]

@@ -163,6 +163,12 @@ def test_defaults_are_told_and_answers_are_not(folder: Path) -> None:
     assert recipe(folder).header.robot.model == "ur5"
 
 
+def test_another_plate_than_the_arms_own_is_written(folder: Path) -> None:
+    shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
+    init("--robot", "ur5", "--scanner", "phoxi-m", "--plate", "ISO 9409-1-80-6-M8")
+    assert recipe(folder).header.feature.standard == "ISO 9409-1-80-6-M8"
+
+
 def test_it_asks_what_it_cannot_see(folder: Path) -> None:
     shutil.copytree(SAMPLE, folder, dirs_exist_ok=True)
     init(typed="ur5\nflange\nphoxi-m\nbase\n")

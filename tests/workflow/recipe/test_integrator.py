@@ -47,7 +47,8 @@ def record(
     for k, row in enumerate(csv.DictReader((SAMPLE / "poses.csv").read_text().splitlines())):
         turn = Rotation.from_quat([float(row[f"q{axis}"]) for axis in "xyzw"])
         place = [1e3 * float(row[f"{axis}_m"]) for axis in "xyz"]
-        name = [f"p{k}"] if heading.startswith("name") else []
+        names = {"name": [f"p{k}"], "file": [f"p{k}.ply"]}
+        name = names.get(heading[:4], [])
         lines.append(separator.join([*name, *(f"{x:.6f}" for x in (*place, *angles(turn)))]))
         write_ply(folder / scan.format(number=numbers[k]), SAMPLE / row["cloud"])
     (folder / "robot.csv").write_text("\n".join(lines) + "\n")
@@ -78,8 +79,15 @@ def write_ply(path: Path, source: Path) -> None:
         ),
         ("X;Y;Z;A;B;C", kuka, "scans/part_{number}.ply", "kuka (--rotation changes it)"),
         ("name,x,y,z,a,b,c", kuka, "frame_{number}.ply", "no number in common"),
+        ("file,x,y,z,a,b,c", kuka, "frame_{number}.ply", "no number in common"),
     ],
-    ids=["vector-in-degrees", "roll-pitch-yaw", "kuka-semicolons-subfolder", "other-names"],
+    ids=[
+        "vector-in-degrees",
+        "roll-pitch-yaw",
+        "kuka-semicolons-subfolder",
+        "other-names",
+        "other-files",
+    ],
 )
 def test_three_commands_lead_to_a_launch_file(
     heading: str, angles: Any, scan: str, guessed: str,

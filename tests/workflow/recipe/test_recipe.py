@@ -323,6 +323,13 @@ def test_an_arm_is_a_word_a_model_or_its_plate_alone(
         assert (RobotModel in context) == ("flange" not in robot)
 
 
+def test_a_plate_named_beside_a_model_replaces_the_models_own(toy_registry: Registry) -> None:
+    text = "robot: {model: ur5, flange: ISO 9409-1-80-6-M8}\n" + STEPS
+    context = parse_recipe(text, "r.yaml", toy_registry).context
+    assert context[Flange].name == "ISO 9409-1-80-6-M8"
+    assert context[Flange].details == context[RobotModel].flange
+
+
 @pytest.mark.parametrize(
     ("scanner", "range_", "whole"),
     [("phoxi-m", (0.458, 1.118), True), ("{name: ACME, range: [300 mm, 1 m]}", (0.3, 1.0), False),

@@ -118,8 +118,8 @@ def read_cloud(
     Args:
         path: A file with one of :data:`CLOUD_FILES`.
         unit: Unit of the file's coordinates, if its heading states none.
-        told: Called with each note about the file: numbers that stand for missing points, and a
-            VIEWPOINT that is not the identity.
+        told: Called with each note about the file: x, y and z as its first index, numbers that
+            stand for missing points, and a VIEWPOINT that is not the identity.
         from_viewpoint: Whether to turn the points into the frame of the file's VIEWPOINT.
 
     Returns:
@@ -131,6 +131,8 @@ def read_cloud(
     with at_hand(path):
         table = _open(path)
         xyz = table.decode()
+    if told and getattr(table, "axes_first", False):
+        told("its rows are x, y and z, with one point a column")
     xyz = marked(path, xyz, told)
     viewpoint: Viewpoint | None = table.viewpoint
     if viewpoint is not None and from_viewpoint:

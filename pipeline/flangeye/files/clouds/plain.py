@@ -90,8 +90,9 @@ def open_npz(path: Path) -> LoadedTable:
         held = ", ".join(f"{name} {array.shape}" for name, (array, _) in by_name.items())
         refuse(path, f"it is not clear which of its arrays holds the points: {held or 'none'}; "
                      "call one points, (N, 3) or (H, W, 3)")  # fmt: skip
-    array, unit = fitting[likely[0]], by_name[likely[0]][1]
-    return LoadedTable(path, array.shape[:-1], array.reshape(-1, array.shape[-1])[:, :3], unit)
+    array, (stored, unit) = fitting[likely[0]], by_name[likely[0]]
+    flat = array.reshape(-1, array.shape[-1])[:, :3]
+    return LoadedTable(path, array.shape[:-1], flat, unit, not _is_wide(stored.shape))
 
 
 def _axes_last(array: NDArray[Any]) -> NDArray[Any] | None:
@@ -268,10 +269,12 @@ class LoadedTable(PointTable):
     Attributes:
         xyz: (N, 3) points.
         unit: Unit of the coordinates, where the arrays' names state it; else empty.
+        axes_first: Whether the file has x, y and z as the first index and not the last.
     """
 
     xyz: NDArray[Any]
     unit: str = ""
+    axes_first: bool = False
 
     def decode(self) -> Points:
         """Return the points in single precision."""

@@ -23,6 +23,7 @@ from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT, LINK, Configuration
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerData
+from flangeye.models.targets import Flange, flange_of, known_standards
 from flangeye.plugin.registry import Registry
 from flangeye.plugin.stage import BoundPart, Params, Part
 from flangeye.types import Floats
@@ -463,8 +464,38 @@ def found_in(
                 why = f"{count} show a target as read, {len(others)} do with {as_yaml(change)}"
                 return others, (), (change, f"{seen.refused}; {why}" if seen.refused else why)
     if seen.refused is not None:
+        if plate := _other_plate(archive, first, recipe, registry):
+            return *plate, None
         raise seen.refused
     return seen.features, remarks, None
+
+
+def _other_plate(
+    archive: Archive, first: Step, recipe: Recipe, registry: Registry
+) -> tuple[dict[str, t.Feature], tuple[Finding, ...]] | None:
+    """Return the features of another standard plate, and the finding that names it.
+
+    None if no other plate is seen either.
+    """
+    stated = recipe.context.get(Flange)
+    if stated is None or stated.bore is None:
+        return None
+    few = replace(archive, recordings=archive.recordings[:FEWEST_SAMPLES])
+    most: tuple[int, str, Recipe] = (0, "", recipe)
+    for standard in known_standards():
+        context = recipe.context | {Flange: flange_of(stated.details, standard)}
+        other = replace(recipe, context=context)
+        count = len(_seen_by(few, first, other, registry).features)
+        most = max(most, (count, standard.designation, other), key=lambda each: each[0])
+    features = _seen_by(archive, first, most[2], registry).features if most[0] else {}
+    if len(features) < FEWEST_SAMPLES:
+        return None
+    what = (
+        f"no scan shows the plate {stated.name}, {len(features)} of {len(archive.recordings)} "
+        f"show {most[1]}"
+    )
+    fix = f"feature: {as_yaml({'standard': most[1]})}"
+    return features, (Finding("wrong plate", what, fix),)
 
 
 def _seen_by(archive: Archive, first: Step, recipe: Recipe, registry: Registry) -> _Seen:

@@ -180,7 +180,8 @@ def _flange(header: Header, robot: RobotModel | None, folder: Path, context: Con
     _refuse_two(feature)
     details = robot.flange if robot else FlangeDetails(standard=_plate(header))
     if not feature.wrist_circle:
-        return flange_of(details, _standard(feature.standard or details.standard, folder, context))
+        named = feature.standard or _plate(header) or details.standard
+        return flange_of(details, _standard(named, folder, context))
     if robot is None:
         raise RecipeError(
             "wrist_circle: how far it lies behind the flange's face is in the robot's file "

@@ -379,6 +379,9 @@ def _head(
     if "flange" in target and not _has_plate(robot):
         question = "which ISO 9409-1 plate the flange has ('flangeye standards')"
         feature = {"standard": questions.ask("plate", question, PLATE, check=load_standard)}
+    elif "flange" in target and (plate := questions.given.get("plate")):
+        load_standard(plate)
+        feature = {"standard": plate}
     if "flange" in target and not robot:
         robot, feature = {"flange": feature["standard"]}, {}
     question = "which scanner ('flangeye scanners')"
