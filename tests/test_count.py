@@ -1,5 +1,9 @@
 """`python -m tools.count` on a tree whose figures are known."""
 
+import ast
+from collections import Counter
+from pathlib import Path
+
 import pytest
 
 from tools.count import CORE_BOUND, count, main, room_of, table
@@ -129,3 +133,18 @@ def test_the_core_is_counted_without_emulators(tree, capsys):
     assert f"code without emulators and studies: 32 (bound {CORE_BOUND})" in said
     assert "code: 33 (bound 42000)" in said
     assert table(count(tree)) + "\n" == said
+
+
+def test_a_name_of_a_class_has_one_meaning() -> None:
+    """A class is defined once, and no other module calls an alias or a constant the same."""
+    root = Path(__file__).parents[1]
+    classes: list[str] = []
+    others: set[str] = set()
+    for path in (p for top in ("pipeline", "plugins") for p in (root / top).rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        classes += [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+        for node in tree.body:
+            if isinstance(node, ast.Assign):
+                others |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+    assert [name for name, times in Counter(classes).items() if times > 1] == []
+    assert sorted(others & {*classes}) == []

@@ -57,7 +57,10 @@ def levels(plan, params, seed, poses):
     """Return the level after each pose of a plan, from the first that may end a run on."""
     reach = Reach(ROBOT, SCANNER, BASE_T_CAMERA, 0.0375)
     site = Site(
-        middle_of_view(SCANNER, BASE_T_CAMERA), BASE_T_CAMERA[:3, 3], reach.facing, reach.joints
+        middle_of_view(SCANNER, BASE_T_CAMERA),
+        BASE_T_CAMERA[:3, 3],
+        reach.facing_rotation,
+        reach.joints,
     )
     planned = plan(site, np.random.default_rng(seed), params)
     arm, rng = ImperfectArm(ROBOT, 1.0, np.random.default_rng(seed)), np.random.default_rng(seed)

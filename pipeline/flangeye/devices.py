@@ -41,7 +41,7 @@ SILENT = 0.15
 program [s]. An arm at 0.5 rad/s takes another 0.12 s to brake, so it is at rest within 0.3 s. A
 computer that halts a process for so long is too busy to move an arm."""
 
-Mode = Literal["ready", "moving", "protective stop", "emergency stop", "not ready"]
+ArmMode = Literal["ready", "moving", "protective stop", "emergency stop", "not ready"]
 
 
 class DeviceError(StageError):
@@ -70,7 +70,7 @@ class RobotState:
     joints: Array
     joint_speeds: Array
     time_ns: int
-    mode: Mode
+    mode: ArmMode
     force: Array | None = None
     message: str = ""
 
@@ -427,7 +427,7 @@ def load_sdk(module: str, driver: str, install: str) -> Any:
         raise DeviceError(f"{driver}: needs {module} ({reason}); {install}") from None
 
 
-Kind = Literal["programs", "libraries"]
+SettingsKind = Literal["programs", "libraries"]
 
 
 def _name(value: Any) -> str:
@@ -448,7 +448,7 @@ def settings_file() -> Path:
     return user_config_path("flangeye") / "machine.toml"
 
 
-def find_named(kind: Kind, name: str) -> Path | None:
+def find_named(kind: SettingsKind, name: str) -> Path | None:
     """Return the file to which this machine's settings map a name; None if they do not.
 
     Raises:
@@ -466,7 +466,7 @@ def find_named(kind: Kind, name: str) -> Path | None:
     return path
 
 
-def require_named(kind: Kind, name: str, asker: str) -> Path:
+def require_named(kind: SettingsKind, name: str, asker: str) -> Path:
     """Return the file to which this machine's settings map a name.
 
     Raises:
@@ -485,7 +485,7 @@ def require_named(kind: Kind, name: str, asker: str) -> Path:
     return path
 
 
-def _entries(kind: Kind) -> dict[str, str]:
+def _entries(kind: SettingsKind) -> dict[str, str]:
     try:
         table = tomllib.loads(settings_file().read_text(encoding="utf-8")).get(kind, {})
     except FileNotFoundError:

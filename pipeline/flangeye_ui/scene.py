@@ -128,8 +128,8 @@ def _capsule(radius: float, ends: Floats) -> Any:
 
 BASE_AXES = 0.25
 """Length of the base's axes [m]."""
-Point = tuple[float, float, float]
-View = tuple[Point, Point, Point]
+Coordinates = tuple[float, float, float]
+View = tuple[Coordinates, Coordinates, Coordinates]
 """Where the camera stands, where it looks [m], and the direction that is up."""
 SCANNED: dict[str, View] = {
     "From the scanner": ((0.0, -0.02, 0.2), (0.0, 0.0, 0.8), (0.0, -1.0, 0.0)),
@@ -304,7 +304,7 @@ def views_of(places: Floats) -> dict[str, View]:
     }  # fmt: skip
 
 
-def _point(place: Floats) -> Point:
+def _point(place: Floats) -> Coordinates:
     x, y, z = place.tolist()
     return x, y, z
 

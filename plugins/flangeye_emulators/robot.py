@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import GRACE, SILENT, ArmMode, Device, DeviceError, Robot, RobotState
 from flangeye.errors import FlangeyeError
 from flangeye.files.processes import busy, python_command
 from flangeye.models.robots import RobotModel
@@ -24,7 +24,7 @@ from flangeye_emulators.controllers.arm import (
 )
 from flangeye_emulators.controllers.client import EmulatorControl, address_of
 from flangeye_emulators.controllers.motion import joint_move, linear_move
-from flangeye_emulators.controllers.mover import Mover, Plan
+from flangeye_emulators.controllers.mover import MotionPlanner, Mover
 from flangeye_emulators.world import bench
 
 
@@ -138,7 +138,7 @@ class SimulatedRobot(Device):
         """Stop the arm."""
         self.stop()
 
-    def _begin(self, plan: Plan) -> None:
+    def _begin(self, plan: MotionPlanner) -> None:
         self._require_ready()
         self._looked = self.cycles
         self._mover.halt()
@@ -148,7 +148,7 @@ class SimulatedRobot(Device):
         if self._stopped_by:
             raise DeviceError(f"{self.name} is in a protective stop: {self._stopped_by}")
 
-    def _mode(self) -> Mode:
+    def _mode(self) -> ArmMode:
         if self._stopped_by:
             return "protective stop"
         return "moving" if self._mover.busy else "ready"

@@ -24,7 +24,7 @@ from flangeye_emulators.controllers.client import EmulatorControl, address_of
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import BenchParams, bench_with
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.raycast import Image, RaycastScene
+from flangeye_emulators.world.raycast import FloatImage, RaycastScene
 from flangeye_emulators.world.scanner import (
     CameraPose,
     ScannerQuality,
@@ -292,7 +292,7 @@ class CellScene:
         modelled = self._arm.flange(stance.joints)
         return float(np.linalg.norm((modelled - stance.base_T_flange)[:3, 3]))
 
-    def scan(self, stances: Sequence[TrueStance], seed: Sequence[int]) -> Image:
+    def scan(self, stances: Sequence[TrueStance], seed: Sequence[int]) -> FloatImage:
         """Return one scan (H, W, 3) in ``camera`` [m] of an arm seen at several stances.
 
         The scan is the mean over the stances; a point missing at one of them is missing.
@@ -304,7 +304,7 @@ class CellScene:
         """Compute in advance what the first scan needs at a stance."""
         self._scene(stance)
 
-    def _look(self, stance: TrueStance, seed: Sequence[int]) -> Image:
+    def _look(self, stance: TrueStance, seed: Sequence[int]) -> FloatImage:
         return self._eye.scan(self._scene(stance), np.random.default_rng(seed))
 
     def _scene(self, stance: TrueStance) -> RaycastScene:

@@ -10,13 +10,13 @@ from flangeye.types import Floats, PoseError
 from flangeye.types.geometry import rotation_log
 from flangeye.units import Length, param
 
-Place = Literal["work", "camera"]
+CostPlace = Literal["work", "camera"]
 
 
 class TranslationParams(Params):
     """Parameters of ``cost.translation``."""
 
-    at: Place = "work"
+    at: CostPlace = "work"
     """Point whose translation counts: the work, or the camera's origin as in the paper."""
 
 
@@ -54,6 +54,6 @@ def cost_work_radius(error: PoseError, params: WorkRadiusParams) -> float:
     return float(np.linalg.norm([*displacement(error, params.at), *lever]))
 
 
-def displacement(error: PoseError, place: Place) -> Floats:
+def displacement(error: PoseError, place: CostPlace) -> Floats:
     """Return the (3,) translation of the error at a place, in ``camera`` [m]."""
     return error.displacement(None if place == "work" else np.zeros(3))

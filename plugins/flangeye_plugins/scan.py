@@ -7,7 +7,7 @@ import numpy as np
 from flangeye import Params, RecipePath, StageError, stage
 from flangeye.devices import KnowsSeams, MotionAllowed, RobotDriver, ScannerDriver
 from flangeye.errors import NothingMoved
-from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
+from flangeye.files.clouds import CLOUD_FILES, FileUnit, read_cloud
 from flangeye.files.scans import natural
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
@@ -33,7 +33,7 @@ class FileScanParams(Params):
 
     path: RecipePath
     """A cloud (PCD, PLY, NPY, XYZ, CSV), or a folder of several, which are joined."""
-    unit: LengthUnit
+    unit: FileUnit
     """Unit of the coordinates; files do not say."""
 
 

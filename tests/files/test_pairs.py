@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from flangeye.errors import StageError
-from flangeye.files.scans import Poses, in_order, natural, numbers_of, partners, scans_in, scans_of
+from flangeye.files.scans import (
+    PoseNames,
+    in_order,
+    natural,
+    numbers_of,
+    partners,
+    scans_in,
+    scans_of,
+)
 from flangeye.types import Warn
 
 
@@ -65,7 +73,7 @@ def test_sets_that_differ_are_refused(poses: str, others: str, message: str) -> 
 
 def test_names_without_a_common_number_are_paired_in_order_with_a_warning(tmp_path: Path) -> None:
     place(tmp_path, *(f"frame_{k}.ply" for k in range(98, 103)))
-    poses = Poses("p.csv", 5, names=[f"p{k}" for k in range(5)], ranked=True)
+    poses = PoseNames("p.csv", 5, names=[f"p{k}" for k in range(5)], ranked=True)
     found, (note,) = scans_of(tmp_path, poses)
     assert [at[0].stem for at in found] == [f"frame_{k}" for k in range(98, 103)]
     assert isinstance(note, Warn)
@@ -87,7 +95,7 @@ def test_a_number_in_common_or_another_count_pairs_nothing_in_order(
     if first == -1:
         names = ["left", *names[1:]]
     with pytest.raises(StageError, match="differ in their numbers"):
-        scans_of(tmp_path, Poses("p.csv", len(names), names=names, ranked=True))
+        scans_of(tmp_path, PoseNames("p.csv", len(names), names=names, ranked=True))
 
 
 def test_rows_without_names_say_with_what_they_were_paired() -> None:
@@ -114,7 +122,7 @@ def test_scans_are_found_beside_and_below_and_clouds_with_images(tmp_path: Path)
     numbers = range(8, 13)
     place(tmp_path, *(f"images/img_{k}.png" for k in numbers))
     place(tmp_path, *(f"clouds/c{k:04}.ply" for k in numbers))
-    poses = Poses("poses/*.txt", 5, [], [f"pose_{k}" for k in numbers])
+    poses = PoseNames("poses/*.txt", 5, [], [f"pose_{k}" for k in numbers])
     found, notes = scans_of(tmp_path, poses)
     assert [[p.name for p in at] for at in found] == [
         [f"c{k:04}.ply", f"img_{k}.png"] for k in numbers
@@ -127,7 +135,7 @@ def test_scans_are_found_beside_and_below_and_clouds_with_images(tmp_path: Path)
 
 def test_a_cloud_and_an_image_of_one_number_lie_in_one_folder(tmp_path: Path) -> None:
     place(tmp_path, *(f"rgb_{k}.png" for k in range(9, 12)), *(f"xyz_{k}.pcd" for k in (9, 10, 11)))
-    found, _ = scans_of(tmp_path, Poses("p.csv", 3))
+    found, _ = scans_of(tmp_path, PoseNames("p.csv", 3))
     assert [[p.name for p in at] for at in found] == [
         [f"xyz_{k}.pcd", f"rgb_{k}.png"] for k in (9, 10, 11)
     ]

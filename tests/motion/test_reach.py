@@ -121,7 +121,7 @@ def rolls(arm: Reach, place: Any) -> list[tuple[float, Any, Any]]:
 
 def test_a_flange_faces_the_scanner_in_the_posture_that_moves_best() -> None:
     arm = seen_from_above()
-    rotation = arm.facing(AHEAD)
+    rotation = arm.facing_rotation(AHEAD)
     assert rotation is not None
     assert rotation[:, 2] == pytest.approx(-OVERHEAD[:3, 2], abs=1e-12)
     assert ARM.flange(arm.home) == pytest.approx(rigid(rotation, AHEAD), abs=1e-8)
@@ -136,7 +136,7 @@ def test_from_where_the_arm_stands_it_takes_the_nearest_posture_that_moves_half_
     assert min(score for score, *_ in every) < 0.5 * best  # some do not move well
     for _, _, start in every:
         arm.start_from(start)
-        arm.facing(place)
+        arm.facing_rotation(place)
         turns = [(np.abs(joints - start).max(), score) for score, _, joints in every]
         nearest = min(turn for turn, score in turns if score >= 0.5 * best)
         # Whole turns of a joint may bring a posture nearer yet.
@@ -146,7 +146,7 @@ def test_from_where_the_arm_stands_it_takes_the_nearest_posture_that_moves_half_
 
 def test_a_place_out_of_reach_has_no_facing_and_is_said_once_for_each_roll() -> None:
     arm = seen_from_above()
-    assert arm.facing(np.array([3.0, 0.0, 0.3])) is None
+    assert arm.facing_rotation(np.array([3.0, 0.0, 0.3])) is None
     assert arm.why_refused() == "8 out of the arm's reach"
     assert all(refusal.place == pytest.approx([3.0, 0.0, 0.3]) for refusal in arm.refusals)
 
@@ -326,7 +326,9 @@ TORCH = load_body("torch", None, Path())
 def test_a_body_is_shown_by_most_of_what_faces_the_camera(body: str) -> None:
     tool = load_body(body, None, Path())
     arm = Reach(MODEL, load_model("scanners", "phoxi-m"), OVERHEAD, tool)
-    site = Site(arm.middle(), OVERHEAD[:3, 3], arm.facing, arm.joints, shown=lambda: arm.shown)
+    site = Site(
+        arm.middle(), OVERHEAD[:3, 3], arm.facing_rotation, arm.joints, shown=lambda: arm.shown
+    )
     poses = poses_near(site.centre, 10, site, np.random.default_rng(0), (0.1, 0.3))
     assert len(poses) == 10
     for pose in poses:
@@ -342,7 +344,7 @@ def test_a_flat_body_turns_its_broad_side_to_the_camera_not_to_a_projector_aside
     aside = {"baseline": 1.4 * np.sin(lean), "convergence": lean}
     eye = scanner(near=0.1, far=9.0, field_of_view=np.radians([100.0, 100.0]), **aside)
     arm = Reach(MODEL, eye, OVERHEAD, load_body("ring-plate", None, Path()))
-    assert arm.facing(AHEAD) is not None
+    assert arm.facing_rotation(AHEAD) is not None
     assert np.abs(arm.shown) == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
 
 

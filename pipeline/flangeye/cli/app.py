@@ -80,7 +80,9 @@ Overrides = Annotated[
         help="Override one value: fit.rim.inlier='0.2 mm', or a step: steps.3=solve.svd.",
     ),
 ]
-LogFile = Annotated[Path, typer.Argument(help="A run: its folder, run.mcap or calibration.yaml.")]
+RunArgument = Annotated[
+    Path, typer.Argument(help="A run: its folder, run.mcap or calibration.yaml.")
+]
 
 
 def _print_version(wanted: bool) -> None:

@@ -48,7 +48,7 @@ def standards() -> None:
         )
 
 
-Out = Annotated[Path | None, typer.Option(help="File to write; default NAME.yaml.")]
+ModelFileOption = Annotated[Path | None, typer.Option(help="File to write; default NAME.yaml.")]
 
 
 @app.command("new-robot")
@@ -71,7 +71,7 @@ def new_robot(  # noqa: PLR0913  one for each option
     standard: Annotated[
         str | None, typer.Option(help="Flange plate, for example ISO 9409-1-50-4-M6.")
     ] = None,
-    out: Out = None,
+    out: ModelFileOption = None,
 ) -> None:
     """Create a robot model from a URDF or from its joints."""
     from flangeye.models.loading import require_new, robot_of_joints, write_robot
@@ -122,7 +122,7 @@ def new_scanner(  # noqa: PLR0913  one for each option
     error: Annotated[
         str | None, typer.Option(help="Smooth distortion, rms, for example '0.1 mm'.")
     ] = None,
-    out: Out = None,
+    out: ModelFileOption = None,
 ) -> None:
     """Create a scanner model.
 

@@ -15,10 +15,10 @@ from flangeye.workflow.result import logged_result, status_of
 from flangeye.workflow.result.contract import (
     CorrectionResult,
     HoldoutResult,
+    NumberList,
     Result,
     TransformResult,
     TruthResult,
-    Vector,
 )
 from flangeye.workflow.result.sections import expected_error
 
@@ -70,7 +70,7 @@ def _listed(values: list[float | None], digits: int) -> str:
     return ", ".join("unknown" if x is None else f"{x:.{digits}f}" for x in values)
 
 
-def _motion(direction: Vector) -> str:
+def _motion(direction: NumberList) -> str:
     """Return ``translation along (0.00, 0.00, 1.00)`` or the like for a unit direction."""
     kinds = (("rotation about", direction[:3]), ("translation along", direction[3:]))
     parts = [(kind, np.array(v)) for kind, v in kinds if np.linalg.norm(v) > 1e-3]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flangeye.cli.app import LogFile, app, load_plugins
+from flangeye.cli.app import RunArgument, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 FORMATS_HINT = "'flangeye export --list' names the formats"
-Camera = Annotated[str | None, typer.Option(help="Camera to export, for a cell with several.")]
+CameraOption = Annotated[
+    str | None, typer.Option(help="Camera to export, for a cell with several.")
+]
 Anyway = Annotated[
     bool,
     typer.Option("--anyway", help="Export a refused calibration too; the file states that."),
@@ -36,7 +38,7 @@ def _list_formats(wanted: bool) -> None:
 
 @app.command()
 def export(
-    run: LogFile,
+    run: RunArgument,
     to: Annotated[
         str | None, typer.Option(help="The format, for example ros2_launch, ur or kuka.")
     ] = None,
@@ -47,7 +49,7 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="File to write, or - to print; default RUN/exports/.")
     ] = None,
-    camera: Camera = None,
+    camera: CameraOption = None,
     anyway: Anyway = False,
     _list: Annotated[
         bool,
@@ -83,7 +85,7 @@ def export(
 
 @app.command()
 def publish(
-    run: LogFile,
+    run: RunArgument,
     parent: Annotated[
         str | None,
         typer.Option(help="tf frame that carries the camera; by default the recipe's."),
@@ -91,7 +93,7 @@ def publish(
     child: Annotated[
         str | None, typer.Option(help="tf frame of the camera; by default the recipe's.")
     ] = None,
-    camera: Camera = None,
+    camera: CameraOption = None,
     anyway: Anyway = False,
 ) -> None:
     """Keep a calibration on the ROS 2 graph (tf_static).

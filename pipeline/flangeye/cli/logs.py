@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flangeye.cli.app import LogFile, Overrides, app, load_plugins, read_recipe
+from flangeye.cli.app import Overrides, RunArgument, app, load_plugins, read_recipe
 from flangeye.cli.console import as_damage, progress_bar, require_undamaged, say, say_notes
 from flangeye.errors import FlangeyeError, RecipeError, StageError
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @app.command()
 def show(
-    log: LogFile,
+    log: RunArgument,
     outlook: Annotated[
         bool,
         typer.Option(
@@ -86,7 +86,7 @@ def _replay(log: Path) -> None:
 
 @app.command()
 def report(
-    log: LogFile,
+    log: RunArgument,
     out: Annotated[
         Path | None, typer.Option(help="File to write; default report.html beside the log.")
     ] = None,
@@ -106,7 +106,7 @@ def report(
 
 @app.command()
 def certificate(  # noqa: PLR0913  one argument an option
-    run: LogFile,
+    run: RunArgument,
     out: Annotated[
         Path | None, typer.Option(help="File to write; default certificate.html beside the log.")
     ] = None,

@@ -31,7 +31,7 @@ RecipeOrNone = Annotated[
     str | None,
     typer.Argument(help="A recipe file, or the name of a bundled recipe."),
 ]
-Recordings = Annotated[
+RecordingsArgument = Annotated[
     str | None,
     typer.Option(
         metavar="PATH|URL",
@@ -52,13 +52,13 @@ Sessions = Annotated[
         metavar="[PATH|URL]...", help="Recordings, one session each; none for simulated recipes."
     ),
 ]
-Grid = Annotated[
+GridOption = Annotated[
     list[str] | None,
     typer.Option(
         "--set-grid", metavar="PATH=A,B,C", help="Run with each of these values; may be repeated."
     ),
 ]
-FromLog = Annotated[
+FromOption = Annotated[
     Path | None,
     typer.Option("--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."),
 ]
@@ -98,10 +98,10 @@ LeaveOut = Annotated[
 @app.command()
 def run(  # noqa: PLR0913  one for each option
     recipe: RecipeOrNone = None,
-    archive: Recordings = None,
+    archive: RecordingsArgument = None,
     overrides: Overrides = None,
     out: Results = None,
-    source: FromLog = None,
+    source: FromOption = None,
     at: AtStep = None,
     move: Move = False,
     offline: Offline = False,
@@ -328,7 +328,7 @@ def batch(  # noqa: PLR0913  one argument an option
     recipe: RecipeName,
     archives: Sessions = None,
     overrides: Overrides = None,
-    grid: Grid = None,
+    grid: GridOption = None,
     repeat: Annotated[
         int | None, typer.Option(min=1, max=10_000_000, help="Number of seeds to run.")
     ] = None,

@@ -29,8 +29,8 @@ IN_LINE = 0.1
 UNKNOWN_SHARE = 0.1
 """A frame counts as unknown if its share of a weak move is this or more."""
 
-Motion = TypeVar("Motion")
-Move = tuple[str, tuple[float, ...]]
+Addition = TypeVar("Addition")
+MissingMotion = tuple[str, tuple[float, ...]]
 """Name of a moving frame, and its unit twist in its parent: a rotation or translation."""
 
 
@@ -65,8 +65,8 @@ def weak_moves(information: Floats, limits: Floats) -> WeakModes:
 
 
 def suggest(
-    information: Floats, limits: Floats, further: Mapping[Motion, Floats]
-) -> tuple[list[Motion], WeakModes]:
+    information: Floats, limits: Floats, further: Mapping[Addition, Floats]
+) -> tuple[list[Addition], WeakModes]:
     """Return motions, chosen greedily, that make the weak moves observable, and what stays weak.
 
     Each step chooses the motion that determines the weak moves best.
@@ -76,7 +76,7 @@ def suggest(
         limits: (P,) largest standard deviation of each unknown [rad, m].
         further: (P, P) information that each motion would add.
     """
-    chosen: list[Motion] = []
+    chosen: list[Addition] = []
     weak = weak_moves(information, limits)
     while weak:
         left = {m: weak_moves(information + more, limits) for m, more in further.items()}
@@ -498,7 +498,7 @@ def _named(problem: Problem, weak: WeakModes, scale: Floats) -> list[str]:
     return [name for name, most in zip(problem.unknown, share, strict=True) if most > UNKNOWN_SHARE]
 
 
-def _asked(problem: Problem, motions: Sequence[Move]) -> list[str]:
+def _asked(problem: Problem, motions: Sequence[MissingMotion]) -> list[str]:
     """Return in words which turns and shifts of which frames to make."""
     axes: dict[tuple[str, bool], list[str]] = {}
     for name, twist in motions:
@@ -537,9 +537,9 @@ def _tie(problem: Problem, named: Sequence[str]) -> str:
 
 def _seen_again(
     problem: Problem, places: Places, freedoms: Mapping[str, Floats] | None
-) -> dict[Move, Floats]:
+) -> dict[MissingMotion, Floats]:
     """Return the information (P, P) of all sightings repeated with one frame moved by a twist."""
-    again: dict[Move, Floats] = {}
+    again: dict[MissingMotion, Floats] = {}
     every = freedoms or {name: np.eye(6) for name in problem.moving}
     for name, twists in every.items():
         for twist in np.transpose(twists):

@@ -11,7 +11,7 @@ from flangeye.errors import StageError
 from flangeye.files.cameras import CameraFile, cameras_in
 from flangeye.files.clouds import (
     PER_METRE,
-    LengthUnit,
+    FileUnit,
     check_cloud_file,
     marked,
     read_cloud,
@@ -25,7 +25,7 @@ from flangeye.types import CAMERA, Floats, PointCloud
 
 def read_scan(
     path: Path,
-    unit: LengthUnit = "m",
+    unit: FileUnit = "m",
     told: Callable[[str], None] | None = None,
     from_viewpoint: bool = False,
 ) -> PointCloud:

@@ -15,8 +15,8 @@ from flangeye.errors import StageError
 from flangeye.files.regular import read_text
 from flangeye.types import Floats
 
-Group = tuple[int, str]
-Entity = tuple[str, list[Group]]
+DxfGroup = tuple[int, str]
+Entity = tuple[str, list[DxfGroup]]
 
 MOST_PIECES = 200_000
 """Most line segments of one drawing."""
@@ -47,7 +47,7 @@ def read_dxf(path: Path) -> tuple[Floats, str | None]:
     return out[long], _unit(groups)
 
 
-def _groups(path: Path) -> list[Group]:
+def _groups(path: Path) -> list[DxfGroup]:
     rows = read_text(path).splitlines()
     try:
         return [(int(rows[k]), rows[k + 1].strip()) for k in range(0, len(rows) - 1, 2)]
@@ -55,7 +55,7 @@ def _groups(path: Path) -> list[Group]:
         raise StageError(f"{path}: is not an ASCII DXF; save it as one (R12 to 2018)") from None
 
 
-def _unit(groups: list[Group]) -> str | None:
+def _unit(groups: list[DxfGroup]) -> str | None:
     for (_, name), (_, value) in pairwise(groups):
         if name == "$INSUNITS":
             # As far as lengths here have such a unit
@@ -63,9 +63,9 @@ def _unit(groups: list[Group]) -> str | None:
     return None
 
 
-def _entities(groups: list[Group]) -> Iterator[Entity]:
+def _entities(groups: list[DxfGroup]) -> Iterator[Entity]:
     """Yield the entities; a POLYLINE comes with its vertices."""
-    inside, name, found = False, "", list[Group]()
+    inside, name, found = False, "", list[DxfGroup]()
     for code, value in [*groups, (0, "EOF")]:
         if code == 2 and name == "SECTION":
             inside = value == "ENTITIES"
@@ -79,7 +79,7 @@ def _entities(groups: list[Group]) -> Iterator[Entity]:
             name, found = value, []
 
 
-def _line(name: str, groups: list[Group]) -> Floats:
+def _line(name: str, groups: list[DxfGroup]) -> Floats:
     """Return an entity as a polyline (N, 3); N is 0 for an entity without lines."""
     of = {code: value for code, value in reversed(groups) if code != 0}
     if name == "LINE":
@@ -94,7 +94,7 @@ def _line(name: str, groups: list[Group]) -> Floats:
     return np.zeros((0, 3))
 
 
-def _upright(path: Path, name: str, groups: list[Group], line: Floats) -> Floats:
+def _upright(path: Path, name: str, groups: list[DxfGroup], line: Floats) -> Floats:
     """Return a flat entity's line in the drawing's axes; entities drawn from below are mirrored."""
     up = float(next((v for c, v in groups if c == 230), "1"))
     if name == "LINE" or not len(line) or abs(up - 1) < 1e-6:
@@ -110,7 +110,7 @@ def _arc(radius: float, start: float, sweep: float) -> Floats:
     return radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
 
 
-def _polyline(name: str, groups: list[Group], closed: bool) -> Floats:
+def _polyline(name: str, groups: list[DxfGroup], closed: bool) -> Floats:
     """Return the line through vertices and arcs; an arc's bulge is tan(angle / 4)."""
     height = next((float(v) for c, v in groups if c == 38), 0.0)
     first = (10,) if name == "LWPOLYLINE" else (0,)

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.clouds import LengthUnit
+from flangeye.files.clouds import FileUnit
 from flangeye.files.remote import remote_digest
 from flangeye.types import CAMERA, FLANGE, TARGET, Floats, Indices, Motion, Note, Role
 
@@ -112,7 +112,7 @@ class Archive:
     root: Path
     recordings: Sequence[Recording]
     files: Sequence[Path]
-    cloud_unit: LengthUnit | None = None
+    cloud_unit: FileUnit | None = None
     notes: Sequence[Note] = ()
 
 

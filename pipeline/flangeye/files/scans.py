@@ -17,7 +17,7 @@ from flangeye.files.images import is_depth_image
 from flangeye.files.recording import Recording
 from flangeye.types import FLANGE, Floats, Warn
 
-Key = str | tuple[int, ...]
+NumberKey = str | tuple[int, ...]
 
 
 def natural(text: str) -> list[tuple[int, str]]:
@@ -179,7 +179,7 @@ def _holds_points(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class Poses:
+class PoseNames:
     """The poses for which scans are sought.
 
     Attributes:
@@ -203,7 +203,7 @@ class Poses:
 
 
 def scans_of(
-    folder: Path, poses: Poses, taken: Collection[Path] = ()
+    folder: Path, poses: PoseNames, taken: Collection[Path] = ()
 ) -> tuple[list[list[Path]], list[str]]:
     """Return the scans of each pose, and notes of how they were paired.
 
@@ -250,7 +250,7 @@ def _scans_by_stem(folder: Path, taken: Collection[Path]) -> dict[str, list[Path
     return found
 
 
-def _paired(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
+def _paired(poses: PoseNames, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
     """Return the scans of each pose, paired by name, or by number for a cloud and an image."""
     kinds = [
         {stem: [p for p in found if is_cloud(p) is kind] for stem, found in scans.items()}
@@ -265,7 +265,7 @@ def _paired(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]
         return _together(Path(poses.where), [_by_name(poses, kind) for kind in split])
 
 
-def _by_name(poses: Poses, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
+def _by_name(poses: PoseNames, scans: dict[str, list[Path]]) -> tuple[list[list[Path]], list[str]]:
     stems = list(scans)
     if not poses.names:
         note = in_order(poses.where, poses.count, "poses", [scans[stem][0].name for stem in stems])

@@ -25,7 +25,7 @@ YAML_BYTES = 1_000_000
 _INTEGER = re.compile(r"[-+]?\d+")
 _SURROGATE = re.compile("[\ud800-\udfff]")
 
-Keys = tuple[Hashable, ...]
+YamlPath = tuple[Hashable, ...]
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Document:
 
     name: str
     data: Any
-    lines: Mapping[Keys, int]
+    lines: Mapping[YamlPath, int]
 
     def line(self, keys: Sequence[Hashable]) -> int:
         """Return the line of the deepest part of ``keys`` that exists."""
@@ -81,7 +81,7 @@ def _parse(text: str, name: str) -> Document:
         raise RecipeError(f"{name}{line}: not valid YAML: {error.problem}") from None
     except yaml.YAMLError as error:
         raise RecipeError(f"{name}: not valid YAML: {str(error).splitlines()[0]}") from None
-    lines: dict[Keys, int] = {}
+    lines: dict[YamlPath, int] = {}
     data = _build(root, (), lines, name) if root is not None else None
     return Document(name, data, lines)
 
@@ -123,7 +123,7 @@ def _refuse_dangers(text: str, name: str, loader: type[yaml.SafeLoader]) -> None
             raise RecipeError(f"{where}: nested deeper than {deepest} levels")
 
 
-def _build(node: yaml.Node, path: Keys, lines: dict[Keys, int], name: str) -> Any:
+def _build(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int], name: str) -> Any:
     lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.MappingNode):
         return _build_mapping(node, path, lines, name)
@@ -148,7 +148,7 @@ def _text(node: yaml.Node, name: str) -> str:
 
 
 def _build_mapping(
-    node: yaml.MappingNode, path: Keys, lines: dict[Keys, int], name: str
+    node: yaml.MappingNode, path: YamlPath, lines: dict[YamlPath, int], name: str
 ) -> dict[Hashable, Any]:
     built: dict[Hashable, Any] = {}
     for key_node, value_node in node.value:

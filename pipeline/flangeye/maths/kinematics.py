@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 
 from flangeye.maths.offset_wrist import (
-    ClosedForm,
     DecompositionFailed,
+    InverseForm,
     OffsetWrist,
     closed_form,
     offset_wrist,
@@ -151,7 +151,7 @@ class Arm:
         self._before = np.array([before for before, _ in fixed])
         self._after = np.array([after for _, after in fixed])
         self._tool = robot.link_T_flange
-        self._forms: dict[int, list[ClosedForm]] = {}
+        self._forms: dict[int, list[InverseForm]] = {}
 
     def perturbed(self, lengths: Floats) -> Arm:
         """Return the arm with (n, 3) added to each joint's ``a``, ``d`` [m] and ``alpha`` [rad]."""
@@ -311,7 +311,7 @@ class Arm:
         return self._closed_form is not None or bool(self._held)
 
     @cached_property
-    def _closed_form(self) -> ClosedForm | None:
+    def _closed_form(self) -> InverseForm | None:
         at_zero = self._six_turning_at_zero
         return at_zero and closed_form(*at_zero)
 
@@ -335,7 +335,7 @@ class Arm:
         solved = [self._solved_when_held(joint) for joint in range(self.n)]
         return sorted(np.flatnonzero(solved).tolist(), key=lambda joint: -solved[joint])
 
-    def _forms_holding(self, joint: int) -> list[ClosedForm]:
+    def _forms_holding(self, joint: int) -> list[InverseForm]:
         """Return closed forms of the other six joints with one held at each of several angles."""
         if joint not in self._forms:
             low, high = max(self.lower[joint], -np.pi), min(self.upper[joint], np.pi)
@@ -360,7 +360,7 @@ class Arm:
             solved += len(self._within_limits(joints[error < self.solved]))
         return solved
 
-    def _form_holding(self, joint: int, angle: float) -> ClosedForm | None:
+    def _form_holding(self, joint: int, angle: float) -> InverseForm | None:
         """Return the closed form of the other six joints."""
         at = np.zeros(self.n)
         at[joint] = angle
@@ -435,7 +435,7 @@ class Arm:
         return joints[kept]
 
 
-def _solutions(forms: Sequence[ClosedForm], base_T_flange: Floats) -> Floats | None:
+def _solutions(forms: Sequence[InverseForm], base_T_flange: Floats) -> Floats | None:
     """Return the solutions (K, n) of closed forms for a pose; None if every form fails."""
     found = []
     for form in forms:

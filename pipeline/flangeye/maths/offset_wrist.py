@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from flangeye.types import Floats, Indices
 
-Numbers = NDArray[np.complex128]
+ComplexNumbers = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +75,12 @@ class OffsetWrist:
             return self._joints(moved[:3, :3], orbits, angles, ways)
 
     def _posture(
-        self, orbits: Numbers, angles: Floats, way: Indices
-    ) -> tuple[Floats, tuple[Numbers, Numbers], tuple[Numbers, Numbers, Numbers]]:
+        self, orbits: ComplexNumbers, angles: Floats, way: Indices
+    ) -> tuple[
+        Floats,
+        tuple[ComplexNumbers, ComplexNumbers],
+        tuple[ComplexNumbers, ComplexNumbers, ComplexNumbers],
+    ]:
         """Return the error of the angle between axes 4 and 5, and the steps that led to it.
 
         Args:
@@ -109,7 +113,7 @@ class OffsetWrist:
         value = ahead.imag * level.real + ahead.real * upwards.real - self.meant
         return value + self.fourth[1] * level.imag, (axis, upwards), (turn, lift, bend)
 
-    def _brackets(self, orbits: Numbers) -> tuple[Floats, Floats]:
+    def _brackets(self, orbits: ComplexNumbers) -> tuple[Floats, Floats]:
         """Return intervals with a sign change, and angles near which a root may be missed.
 
         Each row of samples is one branch; doubtful places are sampled more closely.
@@ -143,7 +147,7 @@ class OffsetWrist:
             starts, row, pitch = doubts - pitch, np.arange(-1.0, 2 * finer + 1), pitch / finer
         return np.hstack(found), np.array([ways, doubts])
 
-    def _refined(self, orbits: Numbers, brackets: Floats) -> Floats:
+    def _refined(self, orbits: ComplexNumbers, brackets: Floats) -> Floats:
         """Return the roots (K,) in brackets (5, K).
 
         By inverse quadratic interpolation, or bisection where that leads out of a bracket.
@@ -166,7 +170,9 @@ class OffsetWrist:
                 break
         return np.asarray(at)
 
-    def _joints(self, turned: Floats, orbits: Numbers, angles: Floats, way: Indices) -> Floats:
+    def _joints(
+        self, turned: Floats, orbits: ComplexNumbers, angles: Floats, way: Indices
+    ) -> Floats:
         """Return joint angles (K, 6) for angles (K,) of joint 6 and branches (K,)."""
         _, (axis, upwards), (turn, lift, bend) = self._posture(orbits, angles, way)
         second = lift / self.upper
@@ -270,7 +276,7 @@ def _across(vector: Floats) -> complex:
     return complex(vector[2], vector[0])
 
 
-ClosedForm = Callable[[Floats], Floats]
+InverseForm = Callable[[Floats], Floats]
 """(4, 4) base_T_flange -> (K, 6) joint angles near its solutions [rad]."""
 
 
@@ -278,7 +284,7 @@ class DecompositionFailed(ArithmeticError):
     """EAIK cannot solve a pose with its decomposition of the arm."""
 
 
-def closed_form(directions: Floats, points: Floats, flange: Floats) -> ClosedForm | None:
+def closed_form(directions: Floats, points: Floats, flange: Floats) -> InverseForm | None:
     """Return the closed form of an arm, or of the nominal one it differs from a little.
 
     Args:
@@ -316,7 +322,7 @@ def _snapped(directions: Floats, points: Floats) -> Floats:
     return snapped
 
 
-def _decomposed(directions: Floats, points: Floats, flange: Floats) -> ClosedForm | None:
+def _decomposed(directions: Floats, points: Floats, flange: Floats) -> InverseForm | None:
     try:
         from eaik.pybindings.EAIK import Robot
     except ImportError:

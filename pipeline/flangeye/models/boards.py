@@ -13,9 +13,9 @@ from pydantic import AfterValidator
 
 from flangeye.types import Floats
 
-Pixels = NDArray[np.uint8]
+BoardImage = NDArray[np.uint8]
 
-Kind = Literal["charuco", "checkerboard", "marker", "circles"]
+BoardKind = Literal["charuco", "checkerboard", "marker", "circles"]
 
 DICTIONARIES = (
     *(f"{bits}X{bits}_{count}" for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
@@ -51,7 +51,7 @@ class Board:
         marker_id: Number of the marker, for a single marker.
     """
 
-    kind: Kind
+    kind: BoardKind
     columns: int
     rows: int
     square: float
@@ -113,7 +113,7 @@ def charuco_of(board: Board) -> Any:
     return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary_of(board.dictionary))
 
 
-def print_of(board: Board, per_square: int = 120) -> Pixels:
+def print_of(board: Board, per_square: int = 120) -> BoardImage:
     """Return the print of a board, (rows, columns) x ``per_square`` pixels, without a margin."""
     import cv2
 
@@ -131,7 +131,7 @@ def print_of(board: Board, per_square: int = 120) -> Pixels:
     return np.kron(squares, np.ones((per_square, per_square), np.uint8))
 
 
-def _discs(board: Board, per_square: int) -> Pixels:
+def _discs(board: Board, per_square: int) -> BoardImage:
     """Return black discs on white."""
     import cv2
 

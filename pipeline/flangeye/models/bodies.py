@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye.errors import RecipeError, StageError
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
 from flangeye.maths.kinematics import Arm
@@ -191,7 +191,7 @@ def body_names() -> list[str]:
     return sorted(path.stem for path in (bundled("data") / "bodies").glob("*.stl"))
 
 
-def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
+def load_body(name: str, unit: FileUnit | None, near: Path) -> TargetBody:
     """Return the body ``name``: a bundled one, or a mesh file beside the recipe.
 
     Args:
@@ -215,7 +215,7 @@ def load_body(name: str, unit: LengthUnit | None, near: Path) -> TargetBody:
     return TargetBody(path.stem, vertices / PER_METRE[used], triangles, note)
 
 
-def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[LengthUnit, str]:
+def _unit_of(path: Path, vertices: Floats, unit: FileUnit | None) -> tuple[FileUnit, str]:
     """Return the unit of a mesh, and how it was inferred; empty if it was stated."""
     across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     sizes = {each: across / PER_METRE[each] for each in PER_METRE}
@@ -223,7 +223,7 @@ def _unit_of(path: Path, vertices: Floats, unit: LengthUnit | None) -> tuple[Len
     in_each = " or ".join(f"{1e3 * sizes[each]:.0f} mm with unit: {each}" for each in fitting)
     limits = f"a body to look for is {SMALLEST * 1e3:g} mm to {LARGEST:g} m across"
     # glTF by definition (2.0, section 3.4), STEP as it is read
-    stated: LengthUnit | None = unit or (
+    stated: FileUnit | None = unit or (
         "m" if path.suffix.lower() in (".glb", *STEP_SUFFIXES) else None
     )
     if stated in fitting:

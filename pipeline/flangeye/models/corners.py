@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.models.boards import DICTIONARIES, Board, Kind, charuco_of, dictionary_of
+from flangeye.models.boards import DICTIONARIES, Board, BoardKind, charuco_of, dictionary_of
 from flangeye.types import Floats, Image, Rejected
 
 Grey = NDArray[np.uint8]
@@ -69,7 +69,7 @@ class SeenBoard(NamedTuple):
         what: The board's parameters as text.
     """
 
-    kind: Kind
+    kind: BoardKind
     params: dict[str, Any]
     what: str
 

@@ -14,7 +14,7 @@ from flangeye.models.model import Model, readable
 from flangeye.types import Floats
 from flangeye.units import Angle, Force, Length, Stiffness, param
 
-Row = tuple[float, float, float]
+MatrixRow = tuple[float, float, float]
 
 
 class Tag(Model):
@@ -51,7 +51,7 @@ class Calibration(Model):
     """Position of the tag in the camera with the finger undeformed."""
     rotation: tuple[Angle, Angle, Angle]
     """Rotation vector of the tag in the camera with the finger undeformed."""
-    gain: tuple[Row, Row, Row]
+    gain: tuple[MatrixRow, MatrixRow, MatrixRow]
     """Displacement of the tip, in the tool's axes, per displacement of the tag."""
     noise: tuple[Length, Length, Length]
     """Standard deviation of one measurement of the tip, in the tool's axes."""

@@ -27,7 +27,7 @@ class Model(Described):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, defer_build=True)
 
 
-Kind = TypeVar("Kind")
+Loaded = TypeVar("Loaded")
 
 
 def readable(cls: type[Any]) -> AfterValidator:
@@ -41,7 +41,7 @@ def readable(cls: type[Any]) -> AfterValidator:
     return AfterValidator(read)
 
 
-def read_model(path: Path, cls: type[Kind]) -> Kind:
+def read_model(path: Path, cls: type[Loaded]) -> Loaded:
     """Read one YAML file into a model, or into a dataclass of checked fields.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flangeye.errors import StageError
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.models.model import Model
 from flangeye.types import Floats, PointCloud
 from flangeye.units import Angle, Length, param
@@ -77,7 +77,7 @@ No wall behind the robot is that far away, and a wrong unit is off by a factor o
 DETECTED_LIMIT = 5.0
 """Largest factor by which the median distance may be outside the range to detect a unit."""
 
-NAMES: Mapping[LengthUnit, str] = {
+NAMES: Mapping[FileUnit, str] = {
     "m": "metres", "mm": "millimetres", "cm": "centimetres", "in": "inches",
 }  # fmt: skip
 
@@ -99,7 +99,7 @@ def times_outside(distance: float, scanner: ScannerData) -> float:
     return max(near / max(distance, 1e-12), distance / far)
 
 
-def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerData) -> None:
+def check_unit(path: Path, distance: float, unit: FileUnit, scanner: ScannerData) -> None:
     """Refuse a unit that the scanner's range contradicts.
 
     Args:
@@ -116,7 +116,7 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerDa
     if not times_outside(distance, scanner) > STATED_LIMIT:
         return
     raw = distance * PER_METRE[unit]
-    others: list[LengthUnit] = [other for other in NAMES if other != unit]
+    others: list[FileUnit] = [other for other in NAMES if other != unit]
     best = min(others, key=lambda other: times_outside(raw / PER_METRE[other], scanner))
     metres = raw / PER_METRE[best]
     if times_outside(metres, scanner) <= DETECTED_LIMIT:
@@ -128,7 +128,7 @@ def check_unit(path: Path, distance: float, unit: LengthUnit, scanner: ScannerDa
     )
 
 
-def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
+def detect_unit(path: Path, raw: float, scanner: ScannerData) -> FileUnit:
     """Return the unit in which a median distance fits the scanner's range: metres or millimetres.
 
     Centimetres and inches lie between the two and are rare, so they have to be stated.
@@ -141,11 +141,11 @@ def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
     Raises:
         StageError: Neither metres nor millimetres fit.
     """
-    units: tuple[LengthUnit, ...] = ("m", "mm")
+    units: tuple[FileUnit, ...] = ("m", "mm")
     outside = {unit: times_outside(raw / PER_METRE[unit], scanner) for unit in units}
     unit = min(units, key=lambda u: outside[u])
     if outside[unit] > DETECTED_LIMIT:
-        others: tuple[LengthUnit, ...] = ("cm", "in")
+        others: tuple[FileUnit, ...] = ("cm", "in")
         fitting = [u for u in others if times_outside(raw / PER_METRE[u], scanner) <= 1.0]
         named = " or ".join(f"unit: {u}" for u in fitting or units)
         cure = f"{named}, which fits," if fitting else f"{named},"
@@ -156,7 +156,7 @@ def detect_unit(path: Path, raw: float, scanner: ScannerData) -> LengthUnit:
     return unit
 
 
-def unit_note(unit: LengthUnit, how: str, distance: float, scanner: ScannerData) -> str:
+def unit_note(unit: FileUnit, how: str, distance: float, scanner: ScannerData) -> str:
     """Return the note about the unit."""
     return (
         f"clouds in {unit} ({how}): the first has its median point at {distance:.3f} m; "

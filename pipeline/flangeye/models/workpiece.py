@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from flangeye.errors import StageError
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.files.paths import WHOLE, bundled_file
 from flangeye.files.regular import read_regular
 from flangeye.models.model import Model, read_model, readable
@@ -60,7 +60,7 @@ class WorkpieceFile(Model):
     title: str
     cad: str
     """File with triangles, beside this one: STL, PLY, …"""
-    unit: LengthUnit
+    unit: FileUnit
     """Unit of the CAD's coordinates and of the seams' points."""
     seams: tuple[SeamLine, ...] = Field(min_length=1)
     source: str = ""
@@ -103,7 +103,7 @@ class Workpiece:
 
     title: str
     path: Path
-    unit: LengthUnit
+    unit: FileUnit
     vertices: Floats
     triangles: NDArray[np.int32]
     seams: Mapping[str, CadSeam]

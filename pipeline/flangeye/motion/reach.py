@@ -54,7 +54,8 @@ class Reach:
         arm: The arm's kinematics.
         shown: (3,) axis of the flange that faces the scanner: z, or where a body is broadest.
         refusals: Requested poses that are impossible.
-        home: (n,) joint angles of the pose that faces the scanner best; see :meth:`facing` [rad].
+        home: (n,) joint angles of the pose that faces the scanner best [rad]; see
+            :meth:`facing_rotation`.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class Reach:
         counts = Counter(refusal.reason for refusal in self.refusals).most_common()
         return ", ".join(f"{count} {reason}" for reason, count in counts)
 
-    def facing(self, centre: Floats) -> Floats | None:
+    def facing_rotation(self, centre: Floats) -> Floats | None:
         """Return the rotation (3, 3) of a flange at ``centre`` that faces along the view.
 
         Its z is opposite to the camera's; a body instead shows its broadest side. About that axis
@@ -149,7 +150,7 @@ class Reach:
         depths = np.arange(scanner.near, scanner.far, 0.1)
         places = eye + depths[np.argsort(np.abs(depths - axis @ (usual - eye)))][:, None] * axis
         for place in places:
-            if self.facing(place) is not None:
+            if self.facing_rotation(place) is not None:
                 self.refusals.clear()
                 return np.asarray(place)
         return usual
@@ -319,8 +320,8 @@ class Site:
     Attributes:
         centre: (3,) default centre of the workspace in ``base`` [m].
         eye: (3,) position of the scanner in ``base`` [m].
-        facing: Returns the rotation (3, 3) of a flange at a point (3,) that faces the scanner; None
-            if the arm cannot reach it.
+        facing_rotation: Returns the rotation (3, 3) of a flange at a point (3,) that faces the
+            scanner; None if the arm cannot reach it.
         joints: Returns the joint angles for a flange pose (4, 4); None if it is unreachable or not
             allowed.
         lost: Returns the indices, in visiting order, of the poses without a capture.
@@ -329,7 +330,7 @@ class Site:
 
     centre: Floats
     eye: Floats
-    facing: Callable[[Floats], Floats | None]
+    facing_rotation: Callable[[Floats], Floats | None]
     joints: Callable[[Floats], Floats | None]
     lost: Callable[[], Collection[int]] = frozenset
     shown: Callable[[], Floats] = lambda: np.array([0.0, 0.0, 1.0])
@@ -387,7 +388,7 @@ def poses_near(
             roll, pitch and yaw [rad].
     """
     found: list[PlannedPose] = []
-    facing, (near, tilt) = site.facing(place), spread
+    facing, (near, tilt) = site.facing_rotation(place), spread
     # Poses tried for each of them
     for _ in range(50 * count):
         if facing is None or len(found) == count:

@@ -33,21 +33,21 @@ class DuplicatePluginError(FlangeyeError):
     """Two plugins offer the same name."""
 
 
-Kind = TypeVar("Kind", Stage, Part)
+PluginType = TypeVar("PluginType", Stage, Part)
 
 
-class PluginTable(MutableMapping[str, Kind]):
+class PluginTable(MutableMapping[str, PluginType]):
     """Stages or parts by name, each imported when it is asked for."""
 
-    def __init__(self, sort: type[Kind]) -> None:
-        self._sort: type[Kind] = sort
-        self._held: dict[str, Kind | str] = {}
+    def __init__(self, sort: type[PluginType]) -> None:
+        self._sort: type[PluginType] = sort
+        self._held: dict[str, PluginType | str] = {}
 
     def put(self, name: str, place: str) -> None:
         """Register ``name``; its object is imported later, from ``module:attribute``."""
         self._held[name] = place
 
-    def __setitem__(self, name: str, plugin: Kind) -> None:
+    def __setitem__(self, name: str, plugin: PluginType) -> None:
         self._held[name] = plugin
 
     def __delitem__(self, name: str) -> None:
@@ -62,7 +62,7 @@ class PluginTable(MutableMapping[str, Kind]):
     def __contains__(self, name: object) -> bool:
         return name in self._held
 
-    def __getitem__(self, name: str) -> Kind:
+    def __getitem__(self, name: str) -> PluginType:
         """Return the plugin ``name``.
 
         Raises:
@@ -74,7 +74,7 @@ class PluginTable(MutableMapping[str, Kind]):
             held = self._held[name] = self._imported(name, held)
         return held
 
-    def _imported(self, name: str, place: str) -> Kind:
+    def _imported(self, name: str, place: str) -> PluginType:
         module, _, attribute = place.partition(":")
         try:
             found = getattr(importlib.import_module(module), attribute)

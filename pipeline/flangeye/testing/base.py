@@ -23,7 +23,7 @@ from flangeye.plugin.stage import KINDS, PARTS, Params, Plugin
 from flangeye.workflow.log.read import read_run
 from flangeye.workflow.log.record import Recorder, adapter, clouds_of
 
-Kind = TypeVar("Kind")
+Tested = TypeVar("Tested")
 
 
 class Conformance:
@@ -167,10 +167,10 @@ def require(holds: object, message: str) -> None:
         raise AssertionError(message)
 
 
-def require_type(value: Any, kind: type[Kind]) -> Kind:
+def require_type(value: Any, kind: type[Tested]) -> Tested:
     """Return a plugin's answer; raise AssertionError unless it is of a type."""
     require(isinstance(value, kind), f"gave {type(value).__name__}, not a {kind.__name__}")
-    return cast("Kind", value)
+    return cast("Tested", value)
 
 
 def require_repeats(call: Callable[[], Any]) -> None:

@@ -180,7 +180,7 @@ class PlanConformance(Conformance):
         site = Site(
             centre=SOURCE_CAMERA[:3, 3] + 0.7 * SOURCE_CAMERA[:3, 2] + shift,
             eye=eye,
-            facing=lambda point: _facing(np.asarray(point), eye),
+            facing_rotation=lambda point: _facing(np.asarray(point), eye),
             joints=lambda pose: np.zeros(arm.n),
         )
         return self.call({}, site, np.random.default_rng(seed))
@@ -219,7 +219,10 @@ class PlanConformance(Conformance):
     def test_a_site_that_shows_nothing_is_no_crash(self) -> None:
         """If the arm cannot show its flange anywhere, the plan is empty or is refused."""
         site = Site(
-            centre=np.zeros(3), eye=np.ones(3), facing=lambda p: None, joints=lambda p: None
+            centre=np.zeros(3),
+            eye=np.ones(3),
+            facing_rotation=lambda p: None,
+            joints=lambda p: None,
         )
 
         def planned() -> Any:

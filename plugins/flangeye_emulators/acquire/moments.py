@@ -61,7 +61,7 @@ class CameraView:
         near: Smallest distance [m].
         far: Largest distance [m].
         field: Full angles of view, horizontal and vertical [rad].
-        facing: Largest angle between the target's z and the line to the camera [rad].
+        max_incidence: Largest angle between the target's z and the line to the camera [rad].
         draws: Number of random joint vectors to try.
     """
 
@@ -69,7 +69,7 @@ class CameraView:
     near: float
     far: float
     field: tuple[float, float]
-    facing: float
+    max_incidence: float
     draws: int = DRAWS
 
     def first(self) -> Floats:
@@ -85,7 +85,7 @@ class CameraView:
         cosine = -(poses[:, :3, 2] * poses[:, :3, 3]).sum(axis=1) / np.maximum(away, 1e-9)
         inside = (np.abs(x) < half[0] * z) & (np.abs(y) < half[1] * z)
         in_range = (z > self.near) & (z < self.far)
-        return np.asarray(inside & in_range & (cosine > np.cos(self.facing)))
+        return np.asarray(inside & in_range & (cosine > np.cos(self.max_incidence)))
 
 
 Sighting = tuple[int, str, str]

@@ -41,7 +41,7 @@ from flangeye.workflow.run.prefetch import cores, prefetched
 from flangeye_emulators.acquire.moments import UNSEEN, VERSION, fingerprint_of, noise_free
 from flangeye_emulators.world.arm import ArmErrors, ImperfectArm
 from flangeye_emulators.world.cell import SimulatedCell
-from flangeye_emulators.world.raycast import Image, SolidBody
+from flangeye_emulators.world.raycast import FloatImage, SolidBody
 from flangeye_emulators.world.scanner import (
     CameraPose,
     ScannerQuality,
@@ -129,7 +129,7 @@ def _explained(
 
 def _site(reach: Reach, base_T_camera: Floats) -> Site:
     eye = base_T_camera[:3, 3]
-    return Site(reach.middle(), eye, reach.facing, reach.joints, shown=lambda: reach.shown)
+    return Site(reach.middle(), eye, reach.facing_rotation, reach.joints, shown=lambda: reach.shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +277,7 @@ class _Visits:
         count = round(self.params.outliers * len(calibration))
         return set(rng.permutation(calibration)[:count].tolist())
 
-    def _capture(self, index: int, xyz: Image, base_T_flange: Floats) -> Capture:
+    def _capture(self, index: int, xyz: FloatImage, base_T_flange: Floats) -> Capture:
         role: Role = "verification" if index < len(self.stops.checks) else "calibration"
         # When simulated runs begin: 2024-01-01, 00:00 UTC
         # From one exposure to the next

@@ -103,7 +103,7 @@ def linear_move(start: Floats, end: Floats, speed: float, acceleration: float) -
     return Travel(between, end, length, speed, acceleration)
 
 
-class Speed:
+class VelocityMotion:
     """A motion at a commanded velocity, reached with limited acceleration.
 
     Attributes:
@@ -137,6 +137,6 @@ class Speed:
         return float(np.abs(change).max())
 
 
-def stop(velocity: Floats, deceleration: float, in_space: bool) -> Speed:
+def stop(velocity: Floats, deceleration: float, in_space: bool) -> VelocityMotion:
     """Return a motion that brakes from a velocity: along the twist, or in joint space."""
-    return Speed(velocity, np.zeros_like(velocity), deceleration, in_space)
+    return VelocityMotion(velocity, np.zeros_like(velocity), deceleration, in_space)

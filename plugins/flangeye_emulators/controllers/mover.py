@@ -8,9 +8,9 @@ import numpy as np
 
 from flangeye.types import Floats
 from flangeye_emulators.controllers.arm import MotionFault, SimulatedArm
-from flangeye_emulators.controllers.motion import ControllerMotion, Speed, stop
+from flangeye_emulators.controllers.motion import ControllerMotion, VelocityMotion, stop
 
-Plan = Callable[[], ControllerMotion]
+MotionPlanner = Callable[[], ControllerMotion]
 """Makes a motion from where the arm stands when its turn comes."""
 
 
@@ -24,7 +24,7 @@ class Mover:
 
     def __init__(self, arm: SimulatedArm) -> None:
         self.arm, self.begun = arm, 0
-        self._queue: deque[Plan] = deque()
+        self._queue: deque[MotionPlanner] = deque()
         self._motion: ControllerMotion | None = None
         self._cycles_left = math.inf
 
@@ -43,9 +43,9 @@ class Mover:
         """Whether a motion is in progress or queued."""
         return self.under_way or self.waiting > 0 or not self.arm.standing
 
-    def append(self, plan: Plan) -> None:
+    def append(self, plan: MotionPlanner) -> None:
         """Append a move to the queue; it begins when the arm is at rest."""
-        if isinstance(self._motion, Speed):
+        if isinstance(self._motion, VelocityMotion):
             self._motion = None
         self._queue.append(plan)
 
@@ -53,9 +53,9 @@ class Mover:
         self, target: Floats, acceleration: float, seconds: float, in_space: bool = True
     ) -> None:
         """Move at a twist (6,), or joint speeds (n,), for some seconds, then brake."""
-        if not isinstance(self._motion, Speed) or self._motion.in_space is not in_space:
+        if not isinstance(self._motion, VelocityMotion) or self._motion.in_space is not in_space:
             velocity = self.arm.twist if in_space else self.arm.speeds
-            self._motion = Speed(velocity, target, acceleration, in_space)
+            self._motion = VelocityMotion(velocity, target, acceleration, in_space)
         self._queue.clear()
         self._motion.target, self._motion.acceleration = np.array(target), acceleration
         self._cycles_left = math.inf if seconds == math.inf else round(seconds / self.arm.cycle)
@@ -72,7 +72,7 @@ class Mover:
         """Choose the motion for the next cycle."""
         if self._motion is not None and self._motion.done:
             self._motion = None
-        if isinstance(self._motion, Speed):
+        if isinstance(self._motion, VelocityMotion):
             self._cycles_left -= 1
             if self._cycles_left < 0:
                 self._motion = None

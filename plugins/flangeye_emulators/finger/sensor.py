@@ -23,7 +23,7 @@ from flangeye_emulators.weld_world.world import ImageQueue, Nominal, WeldWorld
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
-from flangeye_plugins.weld.frame import Tool, WorkSurface, rolled_out
+from flangeye_plugins.weld.frame import Tool, WorkSurface, unrolled
 from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 
 
@@ -70,7 +70,7 @@ class SimulatedFinger(Device):
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
         self._surface, nominal = _as_planned(finger, params)
         self._planned = self._surface.path
-        self.world = WeldWorld(nominal, truth, [seed, 12], self._rolled_out)
+        self.world = WeldWorld(nominal, truth, [seed, 12], self._unrolled)
         self.tool = Tool(finger, self._surface)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
@@ -149,7 +149,7 @@ class SimulatedFinger(Device):
         axes = self.tool.in_plane(base_T_flange)
         return np.asarray(rotation_from_rpy(0.0, 0.0, -pose.angle) @ axes)
 
-    def _rolled_out(self, tip: Floats, torch: Floats) -> Floats:
+    def _unrolled(self, tip: Floats, torch: Floats) -> Floats:
         """Return the torch (3,) in the rolled-out plane, from the tangent plane at the tip."""
         surface = self._surface
         before = self.world.contact.s
@@ -175,7 +175,7 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkSu
     points = seam.points @ pose[:3, :3].T + pose[:3, 3]
     openings = seam.openings @ pose[:3, :3].T
     if params.leg is not None:
-        corners = [corner.point for corner in corners_of(rolled_out(points, openings))]
+        corners = [corner.point for corner in corners_of(unrolled(points, openings))]
         bounds = [0, *corners, len(points) - 1]
         kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
         points, openings = points[kept], openings[kept]

@@ -13,7 +13,7 @@ import numpy as np
 from flangeye.types import Floats
 from flangeye.units import Length
 from flangeye_plugins.weld.joint import WeldJoint, edges_half_angle
-from flangeye_plugins.weld.path import Path, Place
+from flangeye_plugins.weld.path import Path, PathPlace
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class TipContact:
         section = self._groove.section
         return WeldJoint(section.half_angle + wider, section.lean)
 
-    def _springs(self, place: Place, plane_R_tool: Floats | None) -> tuple[Floats, Floats]:
+    def _springs(self, place: PathPlace, plane_R_tool: Floats | None) -> tuple[Floats, Floats]:
         """Return the stiffness across and up (2, 2), and the coupled sliding along the seam (2,).
 
         A leaning finger slides along the seam when it is deflected, held by friction only.

@@ -69,7 +69,7 @@ class WeldWorld:
         nominal: Nominal,
         truth: WeldTruth,
         seed: int | list[int],
-        rolled_out: Callable[[Floats, Floats], Floats] = lambda tip, torch: torch,
+        unrolled: Callable[[Floats, Floats], Floats] = lambda tip, torch: torch,
     ) -> None:
         """Construct a world from nominal and true values.
 
@@ -77,7 +77,7 @@ class WeldWorld:
             nominal: Values that the files state.
             truth: True values of the world.
             seed: Seed of its random values.
-            rolled_out: Maps tip (3,) and torch (3,), both in the tangent plane at the tip, to the
+            unrolled: Maps tip (3,) and torch (3,), both in the tangent plane at the tip, to the
                 torch (3,) in the rolled-out plane; the default is a flat surface.
         """
         rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ class WeldWorld:
         self._tool, self._stands = TrueTool(truth.tool, nominal.torch), nominal.level_R_tool
         self._finger = TrueFinger(truth.finger)
         self._heat = SeamDistortion(truth.heat, self.groove.root.length)
-        self._rolled_out = rolled_out
+        self._unrolled = unrolled
         self.tip, self.torch = np.zeros(3), np.zeros(3)
         self._behind = float(nominal.torch[0])
         self.torch_s, self.off = self._behind, 0.0
@@ -107,7 +107,7 @@ class WeldWorld:
         """
         stands = self._stands if level_R_tool is None else level_R_tool
         pose = self._arm.true_pose(reported)
-        self.torch = self._rolled_out(pose.position, self._tool.torch(pose, stands))
+        self.torch = self._unrolled(pose.position, self._tool.torch(pose, stands))
         root = self.groove.root
         # The plane of a round seam may lie on itself: the torch is where it follows the tip.
         behind = self.contact.s + self._behind

@@ -19,7 +19,7 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats, Indices, Mask
 from flangeye_emulators.world.mesh import Material, Mesh
 
-Image = NDArray[np.float32]
+FloatImage = NDArray[np.float32]
 
 
 SQUARES = ((0, 0), (0, 1), (1, 0), (1, 1))
@@ -49,8 +49,8 @@ class Pixels:
         size: Width of a pixel at unit depth [rad].
     """
 
-    x: Image
-    y: Image
+    x: FloatImage
+    y: FloatImage
     size: float
 
     @property
@@ -59,7 +59,7 @@ class Pixels:
         return len(self.y), len(self.x)
 
     @property
-    def directions(self) -> Image:
+    def directions(self) -> FloatImage:
         """Directions (H, W, 3) of all rays, with z = 1."""
         x, y = np.meshgrid(self.x, self.y)
         return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -98,9 +98,9 @@ class _Met(NamedTuple):
         normals: (3, ...) unit normals; zero without a hit.
     """
 
-    depth: Image
+    depth: FloatImage
     body: NDArray[np.uint8]
-    normals: Image
+    normals: FloatImage
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +114,14 @@ class Hits:
             arbitrary.
     """
 
-    depth: Image
+    depth: FloatImage
     body: NDArray[np.uint8]
-    slant: Image
-    _samples: Image
+    slant: FloatImage
+    _samples: FloatImage
     _between: Indices
-    _normals: Image
+    _normals: FloatImage
 
-    def facing(self, vector: Floats) -> Image:
+    def facing(self, vector: Floats) -> FloatImage:
         """Return the dot product (H, W) of a vector and the unit normal used in ``slant``."""
         x, y, z = (np.float32(v) for v in vector)
         out = _spread(_dot(self._samples, x, y, z), self.depth.shape)
@@ -171,7 +171,7 @@ class RaycastScene:
         normals = np.moveaxis(found["primitive_normals"].numpy(), -1, 0)
         return _Met(found["t_hit"].numpy(), body, np.ascontiguousarray(normals))
 
-    def hidden(self, light: Floats, pixels: Pixels, depth: Image, wanted: Mask) -> Mask:
+    def hidden(self, light: Floats, pixels: Pixels, depth: FloatImage, wanted: Mask) -> Mask:
         """Return the mask (H, W) of pixels whose points are in shadow; exact where ``wanted``.
 
         Rays are cast for every second row and column, and for the others only if the samples around
@@ -205,7 +205,7 @@ class RaycastScene:
         hit = self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0 - 1e-3, nthreads=1)
         return np.asarray(hit.numpy())
 
-    def figure(self, name: str, body: NDArray[np.uint8]) -> Image:
+    def figure(self, name: str, body: NDArray[np.uint8]) -> FloatImage:
         """Return a property of the material at each pixel (H, W); zero without a hit."""
         import cv2
 
@@ -222,7 +222,7 @@ def bands(shape: tuple[int, ...]) -> Iterator[slice]:
         yield slice(start, start + height)
 
 
-def _dot(vectors: Image, x: Any, y: Any, z: Any) -> Image:
+def _dot(vectors: FloatImage, x: Any, y: Any, z: Any) -> FloatImage:
     """Return the dot product of vectors (3, ...) with others given by coordinates."""
     out = vectors[0] * x
     out += vectors[1] * y
@@ -230,7 +230,9 @@ def _dot(vectors: Image, x: Any, y: Any, z: Any) -> Image:
     return np.asarray(out)
 
 
-def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Image]:
+def _in_planes(
+    pixels: Pixels, normals: FloatImage, away: FloatImage
+) -> tuple[FloatImage, FloatImage]:
     """Return depth and slant (H, W) of pixels on the planes of their samples.
 
     Args:
@@ -249,20 +251,20 @@ def _in_planes(pixels: Pixels, normals: Image, away: Image) -> tuple[Image, Imag
     return depth, slant
 
 
-def through(pixels: Pixels, at: Indices) -> tuple[Image, Image]:
+def through(pixels: Pixels, at: Indices) -> tuple[FloatImage, FloatImage]:
     """Return x and y of the directions through pixels, given their flat indices."""
     row = at // len(pixels.x)
     return pixels.x.take(at - row * len(pixels.x)), pixels.y.take(row)
 
 
-def _beams(light: Floats, pixels: Pixels, depth: Image, at: Indices) -> Any:
+def _beams(light: Floats, pixels: Pixels, depth: FloatImage, at: Indices) -> Any:
     """Return Open3D rays (N, 6) from a light to the points seen by pixels at flat indices."""
     z = depth.ravel().take(at)
     x, y = (direction * z for direction in through(pixels, at))
     return _rays(light, *(c - np.float32(of) for c, of in zip((x, y, z), light, strict=True)))
 
 
-def _is_flat(met: _Met, away: Image) -> Mask:
+def _is_flat(met: _Met, away: FloatImage) -> Mask:
     """Return the mask of samples that lie with their eight neighbours in one plane of one body.
 
     Args:

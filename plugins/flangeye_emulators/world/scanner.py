@@ -20,8 +20,8 @@ from flangeye.types import BASE, CAMERA, Floats, Indices, Mask, Transform
 from flangeye.units import Angle, Length, param
 from flangeye_emulators.world import scanner
 from flangeye_emulators.world.raycast import (
+    FloatImage,
     Hits,
-    Image,
     Pixels,
     RaycastScene,
     SolidBody,
@@ -39,7 +39,7 @@ DEGREE = 3
 """Highest total degree of the polynomials: bends of the volume, no ripples."""
 
 
-def steps(depth: Image, width: Image) -> Mask:
+def steps(depth: FloatImage, width: FloatImage) -> Mask:
     """Return the mask (H, W) of pixels with a neighbour beyond a depth step.
 
     Args:
@@ -55,7 +55,10 @@ def steps(depth: Image, width: Image) -> Mask:
 
 
 def _beyond(
-    change: Callable[[Image], NDArray[Any]], depth: Image, widths: float, width: Image
+    change: Callable[[FloatImage], NDArray[Any]],
+    depth: FloatImage,
+    widths: float,
+    width: FloatImage,
 ) -> Mask:
     """Return the mask (H, W) where depth changes to a neighbour by more than ``widths`` pixels."""
     out = np.empty(depth.shape, dtype=bool)
@@ -67,7 +70,7 @@ def _beyond(
     return out
 
 
-def distance_to(marked: Mask) -> Image:
+def distance_to(marked: Mask) -> FloatImage:
     """Return each pixel's distance (H, W) to the nearest marked one [px]."""
     import cv2
 
@@ -75,7 +78,7 @@ def distance_to(marked: Mask) -> Image:
     return np.asarray(cv2.distanceTransform((~marked).view(np.uint8), cv2.DIST_L2, 3))
 
 
-def distance_within(reach: int, marked: Mask) -> Image:
+def distance_within(reach: int, marked: Mask) -> FloatImage:
     """Return :func:`distance_to` up to ``reach`` [px]; larger distances may be overestimated.
 
     It takes half the time, because most of an image is far from any step.
@@ -92,7 +95,7 @@ def distance_within(reach: int, marked: Mask) -> Image:
     return out
 
 
-def lost(distance: Indices | Image, loss: float, grain: Image) -> Mask:
+def lost(distance: Indices | FloatImage, loss: float, grain: FloatImage) -> Mask:
     """Return the mask of pixels that a scanner drops near depth steps.
 
     Args:
@@ -106,7 +109,7 @@ def lost(distance: Indices | Image, loss: float, grain: Image) -> Mask:
     return np.asarray(distance + 0.5 < loss + 0.5 * grain)
 
 
-def rounded(depth: Image, width: Image, blur: float) -> Image:
+def rounded(depth: FloatImage, width: FloatImage, blur: float) -> FloatImage:
     """Return depths with rounded creases, like those smoothed by a scanner.
 
     Two Gaussian averages over 5 x 5 pixels of the same surface are applied near bends and steps;
@@ -139,7 +142,7 @@ def rounded(depth: Image, width: Image, blur: float) -> Image:
     return out
 
 
-def _local_average(depth: Image, at: Indices, width: Image, blur: float) -> Image:
+def _local_average(depth: FloatImage, at: Indices, width: FloatImage, blur: float) -> FloatImage:
     flat, columns = depth.ravel(), depth.shape[1]
     centre = flat.take(at)
     total, weights = np.zeros_like(centre), np.zeros_like(centre)
@@ -154,7 +157,7 @@ def _local_average(depth: Image, at: Indices, width: Image, blur: float) -> Imag
     return total / weights
 
 
-def fly(depth: Image, beside: Mask, rng: np.random.Generator) -> None:
+def fly(depth: FloatImage, beside: Mask, rng: np.random.Generator) -> None:
     """Turn some pixels beside a depth step into flying pixels between its sides, in place.
 
     A pixel that sees both sides reports a depth in between, closer to the side it sees more of.
@@ -174,7 +177,7 @@ def fly(depth: Image, beside: Mask, rng: np.random.Generator) -> None:
     depth.ravel()[at] = own + mix * (other - own)
 
 
-def _neighbours(depth: Image, at: Indices) -> Image:
+def _neighbours(depth: FloatImage, at: Indices) -> FloatImage:
     """Return depths (9, N) at and around pixels at flat indices; the border is replicated."""
     (rows, columns), (row, column) = depth.shape, np.divmod(at, depth.shape[1])
     return np.stack([
@@ -183,7 +186,7 @@ def _neighbours(depth: Image, at: Indices) -> Image:
     ])  # fmt: skip
 
 
-def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Generator) -> Image:
+def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Generator) -> FloatImage:
     """Return an image (H, W) of spatially correlated standard normal values.
 
     Args:
@@ -206,7 +209,7 @@ def correlated_normal(shape: tuple[int, ...], width: float, rng: np.random.Gener
     return np.asarray(np.multiply(blurred, scale, out=blurred))
 
 
-def normal_quantile(probability: Image | Floats) -> Image:
+def normal_quantile(probability: FloatImage | Floats) -> FloatImage:
     """Return the standard normal quantile of a probability, accurate to 0.02.
 
     A logistic approximation is accurate enough for the random effects that use it.
@@ -245,7 +248,7 @@ class Distortion:
             shift = down @ flat[:, :, 0] @ across.T
             self._terms.append((direction + shift).astype(np.float32))
 
-    def depth_error(self, depth: Image, rows: slice = slice(None)) -> Image:
+    def depth_error(self, depth: FloatImage, rows: slice = slice(None)) -> FloatImage:
         """Return the depth error (R, W) in a slice of rows [m]."""
         w = (depth - np.float32(self._middle)) / np.float32(self._half)
         first, second, third, fourth = (term[rows] for term in self._terms[: DEGREE + 1])
@@ -253,7 +256,7 @@ class Distortion:
         cubic = fourth * (np.float32(2.5) * w * w - np.float32(1.5))
         return np.asarray(first + w * (second + cubic) + third * (np.float32(1.5) * w * w - 0.5))
 
-    def points(self, depth: Image) -> Image:
+    def points(self, depth: FloatImage) -> FloatImage:
         """Return the reported points (H, W, 3) for depths (H, W), with lateral errors only."""
         out = np.empty((*depth.shape, 3), dtype=np.float32)
         for rows in bands(depth.shape):
@@ -292,11 +295,11 @@ class _View:
         grain: (R, W) noise factor of the surface; see ``Material``.
     """
 
-    depth: Image
-    cosine: Image
-    strength: Image
-    dazzled: Image
-    grain: Image
+    depth: FloatImage
+    cosine: FloatImage
+    strength: FloatImage
+    dazzled: FloatImage
+    grain: FloatImage
 
 
 class DepthCamera:
@@ -339,9 +342,9 @@ class StructuredLight(DepthCamera):
         lean = scanner.convergence
         # The camera leans towards the projector, which therefore stands a little before it.
         self.projector = scanner.baseline * np.array([np.cos(lean), 0.0, np.sin(lean)])
-        self._inverse_length: Image = 1 / self._length
+        self._inverse_length: FloatImage = 1 / self._length
 
-    def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
+    def scan(self, scene: RaycastScene, rng: np.random.Generator) -> FloatImage:
         """Return the organised scan (H, W, 3) in ``camera`` [m]; missing points are NaN.
 
         Args:
@@ -369,7 +372,7 @@ class StructuredLight(DepthCamera):
         np.copyto(depth, np.float32(np.nan), where=~measured)
         return self._distortion.points(depth)
 
-    def _illuminated(self, scene: RaycastScene, depth: Image) -> Mask:
+    def _illuminated(self, scene: RaycastScene, depth: FloatImage) -> Mask:
         """Return the mask (H, W) of points in range and lit by the projector."""
         seen = np.empty(depth.shape, dtype=bool)
         for rows in bands(depth.shape):
@@ -378,13 +381,13 @@ class StructuredLight(DepthCamera):
             seen[rows] &= self._in_projection(*self._beams(depth, rows))
         return np.asarray(seen & ~scene.hidden(self.projector, self.pixels, depth, seen))
 
-    def _beams(self, depth: Image, rows: slice) -> tuple[Image, Image, Image]:
+    def _beams(self, depth: FloatImage, rows: slice) -> tuple[FloatImage, FloatImage, FloatImage]:
         """Return x, y and z (R, W) of the projector's beams to the points in a slice of rows."""
         x, y, z = self.projector.astype(np.float32)
         pixels, depth = self.pixels, depth[rows]
         return pixels.x * depth - x, pixels.y[rows, None] * depth - y, depth - z
 
-    def _in_projection(self, x: Image, y: Image, z: Image) -> Mask:
+    def _in_projection(self, x: FloatImage, y: FloatImage, z: FloatImage) -> Mask:
         if self.scanner.projection is None:
             return np.ones(x.shape, dtype=bool)
         # The projector leans towards the camera as much as the camera leans towards it.
@@ -394,7 +397,7 @@ class StructuredLight(DepthCamera):
         half_x, half_y = np.tan(np.asarray(self.scanner.projection, dtype=np.float32) / 2)
         return np.asarray((np.abs(aside) <= half_x * ahead) & (np.abs(y) <= half_y * ahead))
 
-    def _view(self, scene: RaycastScene, hits: Hits, to_light: Image, rows: slice) -> _View:
+    def _view(self, scene: RaycastScene, hits: Hits, to_light: FloatImage, rows: slice) -> _View:
         """Return the depth view of a slice of rows.
 
         Args:
@@ -414,7 +417,7 @@ class StructuredLight(DepthCamera):
         gloss = scene.figure("gloss", body)
         shiny = np.flatnonzero(gloss > 0)
         inverse = self._inverse_length[rows]
-        images: tuple[Image, ...] = gloss, to_camera, to_projector, x, y, z, inverse, length
+        images: tuple[FloatImage, ...] = gloss, to_camera, to_projector, x, y, z, inverse, length
         lustre, here, there, x, y, z, inverse, length = (
             image.ravel().take(shiny) for image in images
         )
@@ -425,7 +428,11 @@ class StructuredLight(DepthCamera):
         return _View(depth, cosine, strength, dazzled, scene.figure("grain", body))
 
     def _decode(
-        self, view: _View, distance: Image, grains: tuple[Image, Image], measured: Mask
+        self,
+        view: _View,
+        distance: FloatImage,
+        grains: tuple[FloatImage, FloatImage],
+        measured: Mask,
     ) -> None:
         """Clear the mask, in place, of the points that the scanner fails to measure."""
         # Turned images of the grain are as good as new ones, and cost nothing.
@@ -441,7 +448,7 @@ class StructuredLight(DepthCamera):
             view.dazzled.ravel().take(at)
         )
 
-    def _depth_noise(self, view: _View, distance: Image) -> Image:
+    def _depth_noise(self, view: _View, distance: FloatImage) -> FloatImage:
         """Return the standard deviation of the depth (R, W) [m]."""
         sigma = np.float32(self.noise * self.scanner.temporal_noise) * view.grain
         sigma *= (view.depth / self._middle) ** 2 / np.maximum(view.cosine, np.float32(0.1))
@@ -452,7 +459,7 @@ class StructuredLight(DepthCamera):
         return np.asarray(sigma)
 
 
-def _highlight(cosines: Image, between: Image) -> Image:
+def _highlight(cosines: FloatImage, between: FloatImage) -> FloatImage:
     """Return the strength of a highlight: one where the surface mirrors the beam into the camera.
 
     Args:
@@ -468,7 +475,7 @@ def _highlight(cosines: Image, between: Image) -> Image:
 class TimeOfFlight(DepthCamera):
     """A time-of-flight camera."""
 
-    def scan(self, scene: RaycastScene, rng: np.random.Generator) -> Image:
+    def scan(self, scene: RaycastScene, rng: np.random.Generator) -> FloatImage:
         """Return the organised scan (H, W, 3) in ``camera`` [m]; missing points are NaN.
 
         Args:
@@ -491,7 +498,12 @@ class TimeOfFlight(DepthCamera):
         return points
 
     def _measured(
-        self, scene: RaycastScene, hits: Hits, cosine: Image, strength: Image, grain: Image
+        self,
+        scene: RaycastScene,
+        hits: Hits,
+        cosine: FloatImage,
+        strength: FloatImage,
+        grain: FloatImage,
     ) -> Mask:
         out = (hits.depth >= self.scanner.near) & (hits.depth <= self.scanner.far)
         # Least share of the light of a white surface at mid range that still gives a phase
@@ -506,8 +518,13 @@ class TimeOfFlight(DepthCamera):
         return np.asarray(out)
 
     def _error(
-        self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image, distance: Image
-    ) -> Image:
+        self,
+        scene: RaycastScene,
+        hits: Hits,
+        depth: FloatImage,
+        strength: FloatImage,
+        distance: FloatImage,
+    ) -> FloatImage:
         """Return the error along the ray (H, W) [m] that all scans of a scene share."""
         swing = np.float32(self.noise * self.scanner.calibration_error * np.sqrt(2) / 3)
         # Period of the systematic error in distance [m]: half the wavelength of light modulated at
@@ -521,7 +538,9 @@ class TimeOfFlight(DepthCamera):
         multipath *= np.exp(-distance / np.float32(6.0))
         return np.asarray(wiggle + multipath + self._distortion.depth_error(depth))
 
-    def _sigma(self, scene: RaycastScene, hits: Hits, depth: Image, strength: Image) -> Image:
+    def _sigma(
+        self, scene: RaycastScene, hits: Hits, depth: FloatImage, strength: FloatImage
+    ) -> FloatImage:
         """Return the standard deviation of the random error along the ray (H, W) [m]."""
         sigma = np.float32(self.noise * self.scanner.temporal_noise)
         # Share of the noise that does not depend on the distance; the rest grows with its
@@ -533,7 +552,7 @@ class TimeOfFlight(DepthCamera):
         return np.asarray(sigma * growth * scene.figure("grain", hits.body) / np.sqrt(light))
 
 
-def _mixed(depth: Image, strength: Image) -> Image:
+def _mixed(depth: FloatImage, strength: FloatImage) -> FloatImage:
     """Return the depths of pixels that see a finite spot: the mean weighted by the light.
 
     For depth differences well below the modulation wavelength this is the phase of the sum of the
@@ -549,7 +568,7 @@ def _mixed(depth: Image, strength: Image) -> Image:
     )
 
 
-def _digits(depth: Image) -> Image:
+def _digits(depth: FloatImage) -> FloatImage:
     # Depths are whole millimetres.
     digit = 1e-3
     return np.asarray(np.rint(depth / np.float32(digit)) * np.float32(digit))

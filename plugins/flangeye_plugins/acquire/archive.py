@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from flangeye import StageError, stage
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.files.depth import check_scan, read_scan
 from flangeye.files.recording import Archive, Recording, check_distinct_clouds, digests_of
 from flangeye.files.remote import is_remote
@@ -138,11 +138,11 @@ def _clouds(recordings: Iterable[Recording]) -> Iterator[tuple[Recording, Path]]
 
 def _unit(
     archive: Archive, usable: Sequence[Recording], params: ArchiveParams, scanner: ScannerData
-) -> tuple[LengthUnit, list[str]]:
+) -> tuple[FileUnit, list[str]]:
     """Return the unit of the clouds, and notes on the first cloud."""
     told: list[str] = []
     path, raw = _first_distance(archive.root, usable, params.viewpoint, told)
-    unit: LengthUnit
+    unit: FileUnit
     if params.unit != "auto":
         unit, how = params.unit, "as stated"
     elif archive.cloud_unit is not None:
@@ -169,7 +169,7 @@ def _first_distance(
 
 def _captures(
     usable: Iterable[Recording],
-    unit: LengthUnit,
+    unit: FileUnit,
     scanner: ScannerData,
     params: ArchiveParams,
     cell: Cell | None,

@@ -14,11 +14,11 @@ from pydantic import Field, model_validator
 from flangeye import Params, StageError, stage
 from flangeye.errors import NothingSeen
 from flangeye.files.cameras import CameraFile, camera_in, cameras_in
-from flangeye.files.clouds import LengthUnit
+from flangeye.files.clouds import FileUnit
 from flangeye.files.depth import read_scan
 from flangeye.files.images import is_depth_image
 from flangeye.files.recording import Recording, check_poses, digests_of
-from flangeye.models.boards import Board, Dictionary, Kind
+from flangeye.models.boards import Board, BoardKind, Dictionary
 from flangeye.models.corners import Corners, board_seen, find_corners
 from flangeye.models.scanners import ScannerData, detect_unit, median_distance
 from flangeye.types import (
@@ -56,7 +56,7 @@ Grey = NDArray[np.uint8]
 class SeenBoardParams(Params):
     """The board for calibrating the camera, with the parameters of its fit step."""
 
-    kind: Kind = "charuco"
+    kind: BoardKind = "charuco"
     """charuco, checkerboard, or circles."""
     columns: int = Field(ge=3, le=200)
     """Squares, or circles of a row, from left to right."""
@@ -215,7 +215,7 @@ def _not_shown(
 
 
 def _require_shown(
-    usable: Sequence[Recording], cameras: Mapping[str, Camera], board: Board
+    usable: Sequence[Recording], cameras: Mapping[str, CameraNumbers], board: Board
 ) -> None:
     """Refuse images if none of a sample shows the board, before searching all of them.
 
@@ -334,7 +334,7 @@ def _require_certain(lens: CalibratedLens) -> None:
         )
 
 
-Camera = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
+CameraNumbers = tuple[Floats, Floats] | tuple[Floats, Floats, Floats]
 """Matrix (3, 3) [px], OpenCV's distortion and, where it was found, their covariance (8, 8)."""
 
 
@@ -353,11 +353,11 @@ class ImagesParams(OpeningParams):
     not given."""
     board: SeenBoardParams | None = None
     """Find the camera by the views of this board; refine focal_length, if given."""
-    cloud_unit: LengthUnit | None = None
+    cloud_unit: FileUnit | None = None
     """Unit of the clouds that lie beside the images, where the archive's layout does not say;
     metres or millimetres, whichever scanners can see, if not given."""
 
-    def camera(self, recording: Recording) -> Camera | None:
+    def camera(self, recording: Recording) -> CameraNumbers | None:
         """Return the recipe's camera matrix (3, 3) [px] and distortion, else the archive's."""
         if self.focal_length is None or self.principal_point is None:
             return recording.camera
@@ -392,7 +392,7 @@ def acquire_images(
 
 def _cameras(
     root: Path, usable: Sequence[Recording], params: ImagesParams
-) -> tuple[dict[str, Camera], list[str]]:
+) -> tuple[dict[str, CameraNumbers], list[str]]:
     """Return the camera of each image by the pose's name, and notes on its source."""
     given = {r.id: camera for r in usable if (camera := params.camera(r)) is not None}
     filed = None if given else _filed(root, params.camera_file)
@@ -458,7 +458,7 @@ def _filed(root: Path, name: str | None) -> CameraFile | None:
     return found[0] if found else None
 
 
-def _unit_of_clouds(usable: Sequence[Recording]) -> LengthUnit:
+def _unit_of_clouds(usable: Sequence[Recording]) -> FileUnit:
     for path in (recording.cloud for recording in usable):
         if path and np.isfinite(raw := median_distance(read_scan(path))):
             return detect_unit(path, raw, ScannerData(model="the scanner"))
@@ -466,7 +466,7 @@ def _unit_of_clouds(usable: Sequence[Recording]) -> LengthUnit:
 
 
 def _captures(
-    usable: Sequence[Recording], cameras: Mapping[str, Camera], unit: LengthUnit
+    usable: Sequence[Recording], cameras: Mapping[str, CameraNumbers], unit: FileUnit
 ) -> Iterator[Capture]:
     """Yield the captures, reading one image at a time."""
     nothing = PointCloud(CAMERA, np.zeros((0, 3), dtype=np.float32))

@@ -52,7 +52,9 @@ class Itinerary:
         self.outcomes: Mapping[str, Observation | None] = {}
         self._reach, self._router = reach, router
         eye = base_T_camera[:3, 3]
-        self._site = Site(centre, eye, reach.facing, reach.joints, self._lost, lambda: reach.shown)
+        self._site = Site(
+            centre, eye, reach.facing_rotation, reach.joints, self._lost, lambda: reach.shown
+        )
         self._planned: list[str] = []
         self._checks: list[PlannedPose] = []
         self._plan = Plan([], 0, centre, np.zeros(3))
@@ -242,7 +244,7 @@ def itinerary_of(
     if start is not None:
         reach.start_from(start)
     centre = reach.middle()
-    if reach.facing(centre) is None:
+    if reach.facing_rotation(centre) is None:
         reasons = reach.why_refused() or "no posture is possible"
         raise StageError(
             f"acquire.live: {robot.model} cannot show {what} to {scanner.model} at "

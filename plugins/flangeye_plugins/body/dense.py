@@ -44,13 +44,13 @@ class _Linearised(NamedTuple):
         jacobian: (N, 14) derivatives of the body's surface along the residual.
         residual: (N,) distances of scan points from the body [m].
         place: (N, 3) points on the body, in its frame [m].
-        facing: (N, 3) directions of the residuals, in the body's frame.
+        directions: (N, 3) directions of the residuals, in the body's frame.
     """
 
     jacobian: Floats
     residual: Floats
     place: Floats
-    facing: Floats
+    directions: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,7 +448,7 @@ def _noise(equations: _Linearised, weights: Floats, cluster: Indices, surface: i
 def _patches(equations: _Linearised, shape: Shape) -> Indices:
     # Points of one cell (an eighth of the size) and facing form a patch
     place = np.floor(equations.place / (shape.size / 8)).astype(np.int64)
-    keys = np.column_stack([place, _sextants(equations.facing)])
+    keys = np.column_stack([place, _sextants(equations.directions)])
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
 
@@ -460,7 +460,7 @@ def _pulls(
     place = equations.place @ pose[:3, :3].T + pose[:3, 3]
     middles = np.stack([np.bincount(cluster, x) / many for x in place.T], axis=1)
     each = (equations.jacobian * weights[:, None])[:, :, None]
-    each = each * (equations.facing @ pose[:3, :3].T)[:, None]
+    each = each * (equations.directions @ pose[:3, :3].T)[:, None]
     pulls = np.zeros((len(many), *each.shape[1:]))
     np.add.at(pulls, cluster, each)
     return middles, pulls

@@ -35,7 +35,7 @@ from flangeye_plugins.check.fitting import (
     offset_left_open,
 )
 
-Change = Callable[[Floats], tuple[Floats, Mask]]
+Reordering = Callable[[Floats], tuple[Floats, Mask]]
 """Gives poses (N, 4, 4), and the samples (N,) that have one."""
 
 
@@ -111,7 +111,7 @@ def _backwards(session: RecordedSession) -> Reordered:
 
 
 def _at_other_times(
-    session: RecordedSession, change: Change, arms: Arms, **correction: Any
+    session: RecordedSession, change: Reordering, arms: Arms, **correction: Any
 ) -> Reordered:
     """Return the session with the poses (and links' poses) of other moments."""
     moved, known = change(session.poses)

@@ -21,10 +21,10 @@ from flangeye.types.pose_formats import (
 )
 from flangeye.workflow.doctor.diagnosis import (
     OR_ELSE,
-    Change,
     Finding,
     Findings,
     NotApplicable,
+    PoseChange,
     RecordedSession,
 )
 from flangeye_plugins.check.equations import equations_of
@@ -38,7 +38,7 @@ from flangeye_plugins.check.fitting import (
     pairs_of,
 )
 
-_FLIPPED: Mapping[str, tuple[Change, str]] = {
+_FLIPPED: Mapping[str, tuple[PoseChange, str]] = {
     "inverted": (
         inverted,
         "poses are flange_T_base (or the camera is carried the other way round)",
@@ -156,7 +156,7 @@ def _has_ready_made_markers(session: RecordedSession) -> bool:
     return session.acquire == "acquire.samples" and bool(np.isfinite(session.rotations).any())
 
 
-def _with_markers(session: RecordedSession, change: Change) -> RecordedSession:
+def _with_markers(session: RecordedSession, change: PoseChange) -> RecordedSession:
     """Return the session with the markers' poses changed."""
     rotations, centres = np.array(session.rotations), np.array(session.centres)
     shown = np.isfinite(rotations).all(axis=(1, 2))
@@ -167,7 +167,7 @@ def _with_markers(session: RecordedSession, change: Change) -> RecordedSession:
     return replace(session, rotations=rotations, centres=centres)
 
 
-def _rereading(read_as: str, written_as: str) -> Change:
+def _rereading(read_as: str, written_as: str) -> PoseChange:
     return lambda poses: reread(poses, read_as, written_as)
 
 

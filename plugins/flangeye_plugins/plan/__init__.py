@@ -17,15 +17,15 @@ from flangeye.types import Box, Floats
 from flangeye.types.geometry import angle_between, hat, levers, rigid, rotation_from_rpy
 from flangeye.units import Angle, Length, param
 
-Point = tuple[Length, Length, Length]
+LengthTriple = tuple[Length, Length, Length]
 
 
 class PlanParams(Params):
     """The region in which plans look for poses."""
 
-    centre: Point | None = None
+    centre: LengthTriple | None = None
     """Centre of the work; before the scanner if not given."""
-    size: Point = param(("300 mm", "300 mm", "200 mm"))
+    size: LengthTriple = param(("300 mm", "300 mm", "200 mm"))
     """Edges of the work along the base's axes: where the matrix has to be right."""
     tilt: Angle = param("0.3 rad", ge=0)
     """Largest roll, pitch and yaw away from facing the scanner."""
@@ -56,7 +56,7 @@ def grid(site: Site, rng: np.random.Generator, params: GridParams) -> Plan:
     centre = site.centre if params.centre is None else np.asarray(params.centre)
     size = np.asarray(params.size)
     nodes = rng.permutation(centre + size * _unit_grid(params.counts))
-    facing = site.facing(centre)
+    facing = site.facing_rotation(centre)
     found = [] if facing is None else [_pose_at(n, facing, site, rng, params) for n in nodes]
     return Plan([pose for pose in found if pose is not None], len(nodes), centre, size)
 
@@ -119,7 +119,7 @@ class Chooser:
 
     def poses(self) -> Iterator[PlannedPose]:
         """Yield reachable poses, at each step the most informative one."""
-        facing = self._site.facing(self._work.centre)
+        facing = self._site.facing_rotation(self._work.centre)
         while facing is not None and len(self._visited) < self._params.count:
             chosen = self._choose(facing)
             if chosen is None:

@@ -33,7 +33,7 @@ MM = 1e-3
 
 _AUBO_VERIFICATION = "5"
 
-Poses = Mapping[str, Floats]
+FlangePoses = Mapping[str, Floats]
 
 _POSE_FILE = "calibration_robot_pose_data"
 
@@ -86,7 +86,7 @@ def read_franka(folder: Path) -> Archive:
     return replace(archive, layout="ancorasir franka", notes=notes)
 
 
-def _in_millimetres(folder: Path, poses_file: Path, poses: Poses) -> Archive:
+def _in_millimetres(folder: Path, poses_file: Path, poses: FlangePoses) -> Archive:
     """Return the archive of poses with the clouds and centres of their numbers, in millimetres."""
     clouds = _clouds(folder)
     _refuse_unpaired(clouds, poses, poses_file)
@@ -205,7 +205,7 @@ def _clouds(folder: Path) -> dict[str, Path]:
     return {p.stem.removeprefix("tool0_"): p for p in sorted(folder.glob("tool0_*.pcd"))}
 
 
-def _refuse_unpaired(clouds: Mapping[str, Path], poses: Poses, poses_file: Path) -> None:
+def _refuse_unpaired(clouds: Mapping[str, Path], poses: FlangePoses, poses_file: Path) -> None:
     for name, cloud in clouds.items():
         if name not in poses:
             raise StageError(
@@ -219,7 +219,7 @@ def _centre_files(folder: Path) -> list[Path]:
 
 
 def _with_centres(
-    folder: Path, poses: Poses, clouds: Mapping[str, Path], unit: float
+    folder: Path, poses: FlangePoses, clouds: Mapping[str, Path], unit: float
 ) -> list[Recording]:
     centres = _centres(folder, poses, unit)
     return [
@@ -228,7 +228,7 @@ def _with_centres(
     ]
 
 
-def _centres(folder: Path, poses: Poses, unit: float) -> dict[str, Floats]:
+def _centres(folder: Path, poses: FlangePoses, unit: float) -> dict[str, Floats]:
     """Return the published centres [m] by pose: the pose a column's TCP was copied from."""
     files = _centre_files(folder)
     if len(files) < 2:
@@ -259,7 +259,7 @@ def _same_count(one: Path, n: int, other: Path, m: int) -> None:
         raise StageError(f"{one}: counts differ: {one.name} has {n}, {other.name} has {m}")
 
 
-Robot = Literal["aubo", "ur5", "ur10e", "franka", "kinect", "sample-2019"]
+DatasetArm = Literal["aubo", "ur5", "ur10e", "franka", "kinect", "sample-2019"]
 
 
 @dataclass(frozen=True)
@@ -286,10 +286,10 @@ _DATASETS: Mapping[str, _Location] = {
 class AncorasirParams(Params):
     """Selection of a recording."""
 
-    robot: Robot | None = Field(
+    robot: DatasetArm | None = Field(
         None,
         description="Recording to read; may be left out where the path holds only one. "
-        f"One of {', '.join(get_args(Robot))}.",
+        f"One of {', '.join(get_args(DatasetArm))}.",
     )
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flangeye import Params, StageError
-from flangeye.files.clouds import LengthUnit
-from flangeye.files.tables import Cell, Column, Table, number_of, read_table
+from flangeye.files.clouds import FileUnit
+from flangeye.files.tables import CellValue, Column, Table, number_of, read_table
 from flangeye.types import Floats
 from flangeye.types.pose_formats import (
     ANGLES,
@@ -21,10 +21,10 @@ from flangeye.types.pose_formats import (
     LENGTHS,
     MATRIX,
     PLAIN,
+    LengthUnit,
     pose_of_numbers,
     written,
 )
-from flangeye.types.pose_formats import LengthUnit as PoseLength
 
 POINT = "point"
 
@@ -37,7 +37,7 @@ class WrittenParams(Params):
         "(xyz: fixed, ZYX: turned), matrix (12 or 16 numbers, row by row), 3x3 (9 numbers behind "
         "the position), or a maker's way: " + ", ".join(CONVENTIONS) + ".",
     )
-    length: PoseLength
+    length: LengthUnit
     """Unit of the positions."""
     angle: Literal["deg", "rad"] | None = None
     """Unit of the angles, or of the rotation vector's length."""
@@ -81,7 +81,7 @@ class WrittenParams(Params):
 class CloudUnitParams(Params):
     """Unit of the clouds that belong to poses."""
 
-    cloud_unit: LengthUnit | None = None
+    cloud_unit: FileUnit | None = None
     """Unit of the clouds; found by the scanner's range if not given."""
 
 
@@ -198,7 +198,7 @@ def poses_in(
     ]
 
 
-def _is_unseen(cells: Sequence[Cell], columns: Sequence[int], zeros: bool) -> bool:
+def _is_unseen(cells: Sequence[CellValue], columns: Sequence[int], zeros: bool) -> bool:
     """Return whether a row has no measurement: empty cells, or ``zeros`` only."""
     filled = [cells[c] for c in columns if c < len(cells)]
     if all(str(cell).strip().lower() in ("", "nan") for cell in filled):

@@ -36,7 +36,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from flangeye import Params, RecipeError, StageError, part
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.files.recording import Archive, NotThisLayout, Recording
 from flangeye.files.regular import exists, read_text
 from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES, is_cloud, with_companion
@@ -44,7 +44,7 @@ from flangeye.files.yaml_lines import read_yaml
 from flangeye.types import FLANGE, FLANGE2, Floats, Role
 from flangeye_plugins.reader.poses import pose_from_quaternion, pose_from_rotation_vector
 
-_POSITIONS: Mapping[LengthUnit | None, tuple[str, ...]] = {
+_POSITIONS: Mapping[FileUnit | None, tuple[str, ...]] = {
     "m": ("x_m", "y_m", "z_m"),
     "mm": ("x_mm", "y_mm", "z_mm"),
     None: ("x", "y", "z"),
@@ -97,7 +97,7 @@ def _poses_file(path: Path) -> Path:
     return found[0]
 
 
-def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> LengthUnit:
+def _unit(file: Path, stated: FileUnit | None, param: FileUnit | None) -> FileUnit:
     if stated and param and stated != param:
         raise StageError(f"{file}: positions are in {stated}, but the recipe states unit: {param}")
     unit = stated or param
@@ -109,7 +109,7 @@ def _unit(file: Path, stated: LengthUnit | None, param: LengthUnit | None) -> Le
     return unit
 
 
-def _recording(where: str, row: PoseRow, root: Path, unit: LengthUnit) -> Recording:
+def _recording(where: str, row: PoseRow, root: Path, unit: FileUnit) -> Recording:
     cloud, image = (None if name is None else _scan(root, name) for name in (row.cloud, row.image))
     # A depth image in the column of clouds is a cloud, any other image is none
     if cloud and cloud.suffix.lower() in IMAGES and not is_cloud(cloud):
@@ -134,7 +134,7 @@ def _scan(root: Path, name: str) -> Path:
     return inside[0] if len(inside) == 1 else root / name
 
 
-def _pose(where: str, row: ArmPose, unit: LengthUnit) -> Floats:
+def _pose(where: str, row: ArmPose, unit: FileUnit) -> Floats:
     position = np.array(row.position) / PER_METRE[unit]
     if row.quaternion_xyzw is not None:
         return pose_from_quaternion(where, position, row.quaternion_xyzw)
@@ -193,12 +193,12 @@ class PosesFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
-    unit: LengthUnit | None = None
-    cloud_unit: LengthUnit | None = None
+    unit: FileUnit | None = None
+    cloud_unit: FileUnit | None = None
     poses: tuple[PoseRow, ...]
 
 
-Model = TypeVar("Model", bound=BaseModel)
+FileModel = TypeVar("FileModel", bound=BaseModel)
 
 
 def read_poses(file: Path) -> tuple[PosesFile, list[int]]:
@@ -251,7 +251,7 @@ def _cells(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return rows[0][1], rows[1:]
 
 
-def _unit_of(file: Path, heading: Sequence[str]) -> LengthUnit | None:
+def _unit_of(file: Path, heading: Sequence[str]) -> FileUnit | None:
     _refuse_unknown(file, heading)
     unit = _unit_stated(heading)
     if unit == "none":
@@ -279,7 +279,7 @@ def _refuse_unknown(file: Path, heading: Sequence[str]) -> None:
             )
 
 
-def _unit_stated(heading: Sequence[str]) -> LengthUnit | Literal["none"] | None:
+def _unit_stated(heading: Sequence[str]) -> FileUnit | Literal["none"] | None:
     """Return the unit in the position columns' names; ``none`` without such columns."""
     for unit, names in _POSITIONS.items():
         if set(names) <= set(heading):
@@ -287,9 +287,7 @@ def _unit_stated(heading: Sequence[str]) -> LengthUnit | Literal["none"] | None:
     return "none"
 
 
-def _row(
-    cells: Mapping[str, str], unit: LengthUnit | None, joints: Sequence[str]
-) -> dict[str, Any]:
+def _row(cells: Mapping[str, str], unit: FileUnit | None, joints: Sequence[str]) -> dict[str, Any]:
     """Return a CSV row in the structure of a YAML entry, without empty cells."""
     row: dict[str, Any] = {name: cells[name] for name in _OTHERS if name in cells}
     row |= _grouped(cells, {**_columns_of_pose(unit), "joints_rad": joints})
@@ -299,7 +297,7 @@ def _row(
     return row
 
 
-def _columns_of_pose(unit: LengthUnit | None) -> dict[str, Sequence[str]]:
+def _columns_of_pose(unit: FileUnit | None) -> dict[str, Sequence[str]]:
     return {
         "position": _POSITIONS[unit], "quaternion_xyzw": _QUATERNION,
         "rotation_vector_rad": _VECTOR,
@@ -318,8 +316,8 @@ def _grouped(
 
 
 def _checked(
-    model: type[Model], data: Any, file: Path, line_of: Callable[[tuple[Any, ...]], int]
-) -> Model:
+    model: type[FileModel], data: Any, file: Path, line_of: Callable[[tuple[Any, ...]], int]
+) -> FileModel:
     try:
         return model.model_validate(data)
     except ValidationError as error:

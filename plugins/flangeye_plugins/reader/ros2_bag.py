@@ -27,8 +27,8 @@ from flangeye.units import param
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, Signal, pair
 from flangeye_plugins.reader.ros2_messages import (
     BagFrames,
+    PoseStream,
     Raw,
-    Stream,
     bag_files,
     in_order,
     messages,
@@ -185,7 +185,7 @@ def _joint_angles(message: Any) -> dict[str, float]:
 
 def _arm(
     bag: Bag, params: BagParams, robot: RobotModel | None
-) -> tuple[Stream, str, Stream | None]:
+) -> tuple[PoseStream, str, PoseStream | None]:
     """Return the flange's poses, a text on their source, and the joints, if their order is known.
 
     Raises:
@@ -215,7 +215,9 @@ def _arm(
     raise StageError(f"{bag.path}: no topic gives the flange's pose; {_ways(bag)}")
 
 
-def _by_kinematics(bag: Bag, joints: Stream | None, robot: RobotModel | None) -> tuple[Stream, str]:
+def _by_kinematics(
+    bag: Bag, joints: PoseStream | None, robot: RobotModel | None
+) -> tuple[PoseStream, str]:
     """Return the flange's poses from recorded joint angles, and a text on their source."""
     if robot is None:
         raise StageError(
@@ -258,7 +260,7 @@ def _frame(bag: Bag, given: str | None, usual: Sequence[str]) -> str | None:
     return next((name for name in usual if name in bag.frames.names), None)
 
 
-def _joints(bag: Bag, params: BagParams) -> Stream | None:
+def _joints(bag: Bag, params: BagParams) -> PoseStream | None:
     given = params.robot if params.robot in bag.joints else None
     topics = [given] if given else list(bag.joints)
     if len(topics) != 1:
@@ -284,12 +286,14 @@ class Target:
     poses: Floats
     notes: tuple[str, ...] = ()
 
-    def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
+    def signals(self, arm: PoseStream) -> tuple[Signal, Signal] | None:
         """Angular speeds of arm and target, which are the same in every frame."""
         enough = len(self.times) > 2 and len(arm[0]) > 2
         return (turning(*arm), turning(self.times, self.poses)) if enough else None
 
-    def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
+    def recordings(
+        self, pairs: Sequence[MatchedPose], joints: PoseStream | None
+    ) -> list[Recording]:
         """Return one recording for each pair."""
         return [
             replace(
@@ -329,7 +333,7 @@ class Scans:
         """Times of its messages [s]."""
         return np.array(self.bag.stamps[self.first])
 
-    def signals(self, arm: Stream) -> tuple[Signal, Signal] | None:
+    def signals(self, arm: PoseStream) -> tuple[Signal, Signal] | None:
         """Difference of each value from the one before, if they are frequent enough to compare."""
         # From so many measurements a second on, their own change shows when something moved
         if len(self.times) < 20 or len(arm[0]) < 20 or np.median(np.diff(self.times)) > 1 / 3.0:
@@ -361,7 +365,9 @@ class Scans:
             raise next(iter(self.damaged[topic].values()))
         return found
 
-    def recordings(self, pairs: Sequence[MatchedPose], joints: Stream | None) -> list[Recording]:
+    def recordings(
+        self, pairs: Sequence[MatchedPose], joints: PoseStream | None
+    ) -> list[Recording]:
         """Return one recording for each pair, with cloud and image written as files."""
         chosen = [self._middle(found.events) for found in pairs]
         files = self._files(self.first, chosen)
@@ -447,7 +453,7 @@ def _target(bag: Bag, params: BagParams) -> Target:
     return Target(times, np.array([inverted(pose) for pose in poses]))
 
 
-def _recording(number: int, found: MatchedPose, joints: Stream | None) -> Recording:
+def _recording(number: int, found: MatchedPose, joints: PoseStream | None) -> Recording:
     """Return a recording of the arm's pose, at rest or moving, with its joints if recorded."""
     angles, motion = None, found.motion
     if joints is not None:

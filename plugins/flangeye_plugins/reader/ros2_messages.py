@@ -22,7 +22,7 @@ from flangeye.workflow.log.records import LogFile
 from flangeye_plugins.reader.poses import pose_from_quaternion
 from flangeye_plugins.ros2.messages import cloud_of, frame_of, pixels_of, stamp_of, types
 
-Result = TypeVar("Result")
+Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Raw:
     data: bytes
     decode: Callable[[], Any]
 
-    def read(self, use: Callable[[Any], Result]) -> Result:
+    def read(self, use: Callable[[Any], Decoded]) -> Decoded:
         """Return the result of a function on the message.
 
         Raises:
@@ -215,7 +215,7 @@ def save_image(path: Path, message: Any) -> Path:
     return path.with_suffix(".png")
 
 
-Stream = tuple[Floats, Floats]
+PoseStream = tuple[Floats, Floats]
 """Times (N,) [s], ascending, and poses (N, 4, 4) [m] or joint angles (N, n) [rad]."""
 
 
@@ -226,7 +226,7 @@ def pose_of(where: str, position: Any, turn: Any) -> Floats:
     )
 
 
-def in_order(times: Sequence[float], values: Sequence[Floats]) -> Stream:
+def in_order(times: Sequence[float], values: Sequence[Floats]) -> PoseStream:
     """Return a stream sorted by time, with one value for each time."""
     # Interpolation needs ascending times, each once; several publishers may repeat one
     moments, first = np.unique(np.array(times), return_index=True)
@@ -273,7 +273,7 @@ class BagFrames:
             found.append(self.parents[found[-1]])
         return found
 
-    def between(self, parent: str, child: str) -> Stream:
+    def between(self, parent: str, child: str) -> PoseStream:
         """Return ``parent_T_child`` over time.
 
         Raises:

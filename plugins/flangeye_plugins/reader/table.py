@@ -26,7 +26,7 @@ from pydantic import model_validator
 
 from flangeye import StageError, part
 from flangeye.files.recording import Archive, NotThisLayout, Recording
-from flangeye.files.scans import Poses, recording_of, scans_of
+from flangeye.files.scans import PoseNames, recording_of, scans_of
 from flangeye.files.tables import Column, Table, files_at, number_of, rows_together
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted
@@ -231,7 +231,7 @@ def _scans(folder: Path, text: Table, params: TableParams) -> tuple[list[list[Pa
     """
     column = _scan_column(text, params)
     files = text.files if len(text.files) == len(text.rows) > 1 else ()
-    poses = Poses(str(text.file), len(text.rows), files, text.names, ranked=True)
+    poses = PoseNames(str(text.file), len(text.rows), files, text.names, ranked=True)
     if column is None:
         return scans_of(folder, poses, text.files)
     named = text.texts(column)

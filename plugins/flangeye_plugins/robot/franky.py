@@ -16,7 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.devices import GRACE, SILENT, Device, DeviceError, Mode, Robot, RobotState, load_sdk
+from flangeye.devices import (
+    GRACE,
+    SILENT,
+    ArmMode,
+    Device,
+    DeviceError,
+    Robot,
+    RobotState,
+    load_sdk,
+)
 from flangeye.files.processes import python_command
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
@@ -30,7 +39,7 @@ from flangeye_plugins.robot.tool_check import (
     wrench_at_flange,
 )
 
-MODES: dict[str, tuple[Mode, str]] = {
+MODES: dict[str, tuple[ArmMode, str]] = {
     "Idle": ("ready", ""),
     "Move": ("moving", ""),
     "Guiding": ("not ready", "the arm is being guided by hand: let go of it"),

@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple, TextIO
 import numpy as np
 from pydantic import Field, field_validator
 
-from flangeye.devices import Device, DeviceError, Mode, Robot, RobotState
+from flangeye.devices import ArmMode, Device, DeviceError, Robot, RobotState
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import Params, part
@@ -181,7 +181,7 @@ class ManualRobot(Device):
     def close(self) -> None:
         """Do nothing: an operator moves the arm."""
 
-    def _mode(self) -> Mode:
+    def _mode(self) -> ArmMode:
         if self._stopped:
             return "not ready"
         return "moving" if self._waiting else "ready"

@@ -17,7 +17,7 @@ from flangeye.models.scanners import (
 from flangeye.plugin.stage import Params
 from flangeye.types import CAMERA, Image, PointCloud
 
-Numbers = NDArray[Any]
+AnyArray = NDArray[Any]
 
 
 class ColourCamera(NamedTuple):
@@ -49,7 +49,7 @@ class DepthView:
         self.matrix, self.distortion = np.array(matrix), np.array(distortion)
         self.colour = None if colour is None else ColourCamera(**colour)
 
-    def points(self, depth: Numbers) -> NDArray[np.float32]:
+    def points(self, depth: AnyArray) -> NDArray[np.float32]:
         """Return points (H, W, 3) of a depth image (H, W), in its unit; zero where it is zero."""
         import cv2
 
@@ -61,7 +61,7 @@ class DepthView:
         xyz = np.dstack([rays, np.ones(depth.shape)]) * depth[..., None]
         return np.asarray(xyz, dtype=np.float32)
 
-    def coloured(self, xyz: Numbers, colour: Numbers) -> Image | None:
+    def coloured(self, xyz: AnyArray, colour: AnyArray) -> Image | None:
         """Return the colour image as seen from the depth camera.
 
         Args:

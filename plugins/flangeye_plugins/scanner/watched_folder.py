@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from flangeye.devices import DeviceError, Scan, Scanner
 from flangeye.errors import StageError
-from flangeye.files.clouds import CLOUD_FILES, LengthUnit, read_cloud
+from flangeye.files.clouds import CLOUD_FILES, FileUnit, read_cloud
 from flangeye.files.paths import RecipePath
 from flangeye.files.scans import natural
 from flangeye.models.scanners import ScannerModel, check_unit, median_distance
@@ -24,7 +24,7 @@ class WatchedFolderParams(Params):
 
     path: RecipePath
     """Folder that the scanner's software exports into."""
-    unit: LengthUnit
+    unit: FileUnit
     """Unit of the files' coordinates; files do not say."""
     pattern: str = "*"
     """File name pattern, for example 'scan_*.ply'."""

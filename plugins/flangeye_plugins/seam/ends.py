@@ -9,33 +9,33 @@ from flangeye.types import Floats, Mask
 from flangeye_plugins.seam.sweep import Sweep
 from flangeye_plugins.seam.template import EDGES
 
-FEWEST_LANES = 5
-"""Smallest number of lanes from which an end is estimated."""
+FEWEST_STRIPS = 5
+"""Smallest number of strips from which an end is estimated."""
 SEAM_WITHIN = 8e-3
-"""Largest distance from the seam of the lanes that define its end [m]."""
+"""Largest distance from the seam of the strips that define its end [m]."""
 
 
-def last_in_lanes(lanes: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.intp], Floats]:
-    """Return each lane's last point, and the distance (L,) from there to the surface's end [m].
+def last_in_strips(strips: Floats, way: Floats, pitch: float) -> tuple[NDArray[np.intp], Floats]:
+    """Return each strip's last point, and the distance (L,) from there to the surface's end [m].
 
     A surface ends on average half a point spacing beyond its last point.
 
     Args:
-        lanes: (N,) positions across the lanes, which are one ``pitch`` wide [m].
-        way: (N,) positions along the lanes [m].
+        strips: (N,) positions across the strips, which are one ``pitch`` wide [m].
+        way: (N,) positions along the strips [m].
         pitch: Distance between neighbouring points [m].
     """
     if not len(way):
         return np.zeros(0, dtype=np.intp), np.zeros(0)
-    lane = np.floor(lanes / pitch).astype(int)
-    # By lane, then along it: each lane's last entry is its last point.
-    order = np.lexsort((way, lane))
-    last = np.append(np.diff(lane[order]) != 0, True)
+    strip = np.floor(strips / pitch).astype(int)
+    # By strip, then along it: each strip's last entry is its last point.
+    order = np.lexsort((way, strip))
+    last = np.append(np.diff(strip[order]) != 0, True)
     first = np.append(True, last[:-1])
     spans = way[order[last]] - way[order[first]]
     counts = np.diff(np.append(-1, np.flatnonzero(last)))
     gaps = spans / np.maximum(counts - 1, 1)
-    # With fewer points a lane's spacing, and half of it, is not known.
+    # With fewer points a strip's spacing, and half of it, is not known.
     full = counts >= 4
     return order[last][full], gaps[full] / 2
 
@@ -56,10 +56,10 @@ def face_ends(
         beside = q[on] @ section.normals[edge] - section.heights[edge]
         # Farther in on the plate nothing shows its edge; far beyond the edge is another part.
         near = (beside > -SEAM_WITHIN) & (beside < SEAM_WITHIN / 2)
-        if near.sum() < 4 * FEWEST_LANES:
+        if near.sum() < 4 * FEWEST_STRIPS:
             continue
         at = np.flatnonzero(on)[near]
-        last, more = last_in_lanes(local[at, 0], beside[near], pitch)
+        last, more = last_in_strips(local[at, 0], beside[near], pitch)
         if not len(last):
             continue
         turned = section.angles[edge] + swept.spline.at(local[at[last], 0])[:, 2]
@@ -96,31 +96,31 @@ class End:
 
 
 def surface_end(way: Floats, past: Mask, covered: Mask, pitch: float) -> End | None:
-    """Return a surface's end, estimated from the ends of its lanes; None with too few lanes.
+    """Return a surface's end, estimated from the ends of its strips; None with too few strips.
 
-    It is the median over lanes. If enough lanes end before visible background, only these count. If
-    the lanes' ends are spread over more than two pixels, they are not a sample of one position, and
-    averaging does not reduce the standard deviation.
+    It is the median over strips. If enough strips end before visible background, only these
+    count. If the strips' ends are spread over more than two pixels, they are not a sample of one
+    position, and averaging does not reduce the standard deviation.
 
     Args:
-        way: (L,) ends of the lanes, as distances along the seam [m].
-        past: (L,) whether the scanner sees background beyond each lane's end.
-        covered: (L,) whether something hides what is beyond each lane's end.
+        way: (L,) ends of the strips, as distances along the seam [m].
+        past: (L,) whether the scanner sees background beyond each strip's end.
+        covered: (L,) whether something hides what is beyond each strip's end.
         pitch: Distance between neighbouring points [m].
     """
-    if len(way) < FEWEST_LANES:
+    if len(way) < FEWEST_STRIPS:
         return None
-    seen = past.sum() >= FEWEST_LANES
+    seen = past.sum() >= FEWEST_STRIPS
     way = way[past] if seen else way
     low, middle, high = np.quantile(way, [0.25, 0.5, 0.75])
-    # The standard deviation of a median is 1.25 times that of a mean; lanes spread over more than
+    # The standard deviation of a median is 1.25 times that of a mean; strips spread over more than
     # two pixels end at different positions, which averaging does not improve
     share = 1.25 / np.sqrt(len(way)) if seen and high - low <= 2.0 * pitch else 1.0
     # Standard deviation of a normal distribution over its interquartile range
     sigma_of_iqr = 0.7413
     deviation = float(share * sigma_of_iqr * (high - low))
     return End(
-        float(middle), deviation, bool(seen), bool(not seen and covered.sum() >= FEWEST_LANES)
+        float(middle), deviation, bool(seen), bool(not seen and covered.sum() >= FEWEST_STRIPS)
     )
 
 

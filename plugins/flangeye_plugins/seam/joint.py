@@ -19,7 +19,7 @@ from flangeye_plugins.seam.ends import (
     Rays,
     earliest_end,
     face_ends,
-    last_in_lanes,
+    last_in_strips,
     surface_end,
     surfaces,
 )
@@ -274,7 +274,7 @@ def _end(found: FoundJoint, sign: int) -> tuple[float, float]:
     # Pixels beyond a surface's last point at which the scanner may look past its end
     beyond = (1.0, 2.0, 3.0, 4.0)
     for on in surfaces(swept, local, 4 * swept.sigma).values():
-        last, more = last_in_lanes(across[on], sign * local[on, 0], pitch)
+        last, more = last_in_strips(across[on], sign * local[on, 0], pitch)
         at = local[on][last, :3]
         on_beyond = sign * (more + pitch * np.array(beyond)[:, None]).ravel()
         there = np.tile(at, (len(beyond), 1)) + np.outer(on_beyond, [1, 0, 0])

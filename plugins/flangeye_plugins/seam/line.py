@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from flangeye import StageError, stage
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.files.drawings import read_dxf
 from flangeye.files.paths import RecipeFile
 from flangeye.files.tables import read_table
@@ -33,7 +33,7 @@ class LineParams(SeamParams, PlaceParams):
     path: RecipeFile
     """Points or taught poses in order (CSV, YAML, JSON), a drawing (DXF), or CAD whose sharp edges
     are lines (STL, PLY, OBJ, STEP)."""
-    unit: LengthUnit
+    unit: FileUnit
     """Unit of the coordinates."""
     near: tuple[Length, Length, Length] | None = None
     """Point in the file's frame; of several lines the nearest to it is used."""
@@ -86,7 +86,7 @@ def _line(params: LineParams) -> Floats:
     return min(lines, key=lambda line: float(distances_to_line(at, line)[0]))
 
 
-def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
+def _lines(path: Path, unit: FileUnit, angle: float) -> list[Floats]:
     """Return all lines (N, 3) of a file [m]."""
     suffix = path.suffix.lower()
     tables = (".csv", ".txt", ".yaml", ".yml", ".json")
@@ -112,7 +112,7 @@ def _lines(path: Path, unit: LengthUnit, angle: float) -> list[Floats]:
     raise StageError(f"{path}: '{path.suffix}' holds no line; known: {known}")
 
 
-def _points(path: Path, unit: LengthUnit) -> Floats:
+def _points(path: Path, unit: FileUnit) -> Floats:
     """Return the points (N, 3) of a table or of a list of poses, in the file's unit.
 
     They are the columns x, y, z or x_mm, y_mm, z_mm, the positions of poses in YAML or JSON, or the

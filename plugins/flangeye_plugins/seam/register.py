@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flangeye import CalibrationRefused, StageError
-from flangeye.files.clouds import PER_METRE, LengthUnit
+from flangeye.files.clouds import PER_METRE, FileUnit
 from flangeye.maths.seam_geometry import distances_to_line
 from flangeye.models.workpiece import CadSeam, Workpiece
 from flangeye.types import Floats, Singles
@@ -119,8 +119,8 @@ def check_unit(points: Floats, workpiece: Workpiece) -> None:
     )
 
 
-def _other_unit(size: float, unit: LengthUnit, extent: float) -> str:
-    other: LengthUnit = "m" if unit == "mm" else "mm"
+def _other_unit(size: float, unit: FileUnit, extent: float) -> str:
+    other: FileUnit = "m" if unit == "mm" else "mm"
     resized = size * PER_METRE[unit] / PER_METRE[other]
     if resized < LARGER * extent:
         return f"with unit: {other} it would be {resized:.4g} m: set unit: {other}"

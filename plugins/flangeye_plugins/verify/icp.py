@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from flangeye import Params, StageError, stage
-from flangeye.files.clouds import LengthUnit
+from flangeye.files.clouds import FileUnit
 from flangeye.files.paths import RecipeFile
 from flangeye.maths.arm_correction import corrected_view
 from flangeye.maths.kinematics import Arm
@@ -31,7 +31,7 @@ class CadCloud(Params):
 
     file: RecipeFile
     """PCD, PLY, XYZ, CSV or NPY; rows that are not finite are left out."""
-    unit: LengthUnit
+    unit: FileUnit
     """Unit of the file's coordinates."""
     offset: tuple[Length, Length, Length] = param(("0 mm", "0 mm", "0 mm"))
     """Position of the file's origin in the flange's frame."""

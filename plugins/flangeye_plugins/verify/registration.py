@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flangeye import StageError
-from flangeye.files.clouds import LengthUnit, read_cloud
+from flangeye.files.clouds import FileUnit, read_cloud
 from flangeye.maths.statistics import rms
 from flangeye.models.targets import Flange
 from flangeye.types import Floats
@@ -109,7 +109,7 @@ def _in_a_hole(points: Floats, flange: Flange) -> NDArray[np.bool_]:
     return np.asarray(drilled & (points[:, 2] == 0.0))
 
 
-def read_surface(path: Path, unit: LengthUnit, rotation: Floats, offset: Floats) -> SampledSurface:
+def read_surface(path: Path, unit: FileUnit, rotation: Floats, offset: Floats) -> SampledSurface:
     """Return a CAD cloud in ``flange``, with normals estimated from nearest neighbours.
 
     Args:

@@ -16,7 +16,7 @@ from flangeye_plugins.weld.following.steering import Steering, Weave
 from flangeye_plugins.weld.frame import LeaningTool, WorkSurface
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import flange_speed
-from flangeye_plugins.weld.settings import Following, Mode
+from flangeye_plugins.weld.settings import ControllerChoice, Following
 from flangeye_plugins.weld.touch.tag_observation import TagDetector
 
 SEATING = 1.4
@@ -45,7 +45,7 @@ def check_finger(finger: Finger, settings: Following) -> None:
         )
 
 
-def check_controller(mode: Mode, driver: RobotDriver) -> None:
+def check_controller(mode: ControllerChoice, driver: RobotDriver) -> None:
     """Refuse a simulation-only controller on a real arm.
 
     Raises:

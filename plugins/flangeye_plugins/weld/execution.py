@@ -24,7 +24,7 @@ from flangeye_plugins.weld.following.search import UNTOUCHED
 from flangeye_plugins.weld.frame import Tool
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.reachability import SeamReach
-from flangeye_plugins.weld.settings import Following, Mode
+from flangeye_plugins.weld.settings import ControllerChoice, Following
 from flangeye_plugins.weld.touch.tip_displacement import TipDisplacement
 from flangeye_plugins.weld.weld_log import Cycle, WeldLog
 
@@ -91,7 +91,7 @@ class WeldCell:
     gas_after: float | None = None
 
 
-def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: Mode) -> None:
+def approach(cell: WeldCell, passage: SeamReach, weld_log: WeldLog, mode: ControllerChoice) -> None:
     """Move the tip above the planned start, with the tool aligned with the seam.
 
     Raises:

@@ -18,7 +18,7 @@ from flangeye.models.finger import FingerGeometry
 from flangeye.motion.seam_following import Command, ToolPose
 from flangeye.types import BASE, FLANGE, Floats, Transform
 from flangeye.types.geometry import arc_lengths, rigid, rotation_from_rpy, rows_at
-from flangeye_plugins.weld.path import CHORD, Path, Place
+from flangeye_plugins.weld.path import CHORD, Path, PathPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class SeamPlace(NamedTuple):
 
     point: Floats
     axes: Floats
-    place: Place
+    place: PathPlace
 
     def rolled(self, vectors: Floats) -> Floats:
         """Convert a vector (3,) in base to the axes of the rolled-out plane."""
@@ -102,7 +102,7 @@ class WorkSurface:
     def __init__(self, points: Floats, openings: Floats) -> None:
         """Construct the surface from a seam's points (N, 3) [m] and openings (N, 3) in base."""
         points, openings, wraps = _gone_around(points, openings)
-        self.points = rolled_out(points, openings)
+        self.points = unrolled(points, openings)
         self.path = Path(self.points, wraps)
         along = arc_lengths(self.points)
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
@@ -266,7 +266,7 @@ def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, floa
     return rows[:, :3], rows[:, 3:], turn
 
 
-def rolled_out(points: Floats, openings: Floats) -> Floats:
+def unrolled(points: Floats, openings: Floats) -> Floats:
     """Return a seam's points in the plane (N, 3), with the distances and turns of the surface."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)

@@ -17,7 +17,7 @@ CHORD = 5e-3
 """Chord length for computing a path's direction and curvature [m]."""
 
 
-class Place(NamedTuple):
+class PathPlace(NamedTuple):
     """One place on a path.
 
     Attributes:
@@ -91,10 +91,10 @@ class Path:
         inner = (angles[span:] - angles[:-span]) / (span * self.step)
         return np.pad(inner, (span, len(self.points) - span - len(inner)), mode="edge")
 
-    def at(self, s: float) -> Place:
+    def at(self, s: float) -> PathPlace:
         """Return the place at arc length ``s``, which may lie beyond either end."""
         x, y, tx, ty, z = self._at(s)
-        return Place(np.array([x, y]), np.array([tx, ty]), np.array([-ty, tx]), z)
+        return PathPlace(np.array([x, y]), np.array([tx, ty]), np.array([-ty, tx]), z)
 
     def _at(self, s: float) -> tuple[float, float, float, float, float]:
         """Return point (2), unit tangent (2) and height at an arc length."""

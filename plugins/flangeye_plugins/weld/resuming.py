@@ -27,13 +27,13 @@ from flangeye_plugins.weld.following.steering import SETTLING
 from flangeye_plugins.weld.following.task import ResumePoint, WeldStart, WeldTask
 from flangeye_plugins.weld.passes import MultiPassController, follower_of
 from flangeye_plugins.weld.path import Path
-from flangeye_plugins.weld.settings import Following, Mode, WeldTactileParams
+from flangeye_plugins.weld.settings import ControllerChoice, Following, WeldTactileParams
 
 RUN_IN = 2 * SETTLING
 """Run-in before the arc, in which the torch recovers from its displacement by the sweep [m]."""
 
 
-def controller_of(task: WeldTask, mode: Mode) -> Controller:
+def controller_of(task: WeldTask, mode: ControllerChoice) -> Controller:
     """Return the controller that carries out a task in a mode."""
     if isinstance(mode, BoundPart):
         controller: Controller = mode(task_of(task.plan, task.prior.distance, task.settings))
@@ -51,7 +51,7 @@ def task_of(plan: Path, distance: float, settings: Following) -> FollowingTask:
     )  # fmt: skip
 
 
-def _mode_of(logged: str | Mapping[str, Any]) -> Mode:
+def _mode_of(logged: str | Mapping[str, Any]) -> ControllerChoice:
     """Return the mode named in a log; a plugin's controller must be installed."""
     if logged in ("tactile", "vision"):
         return logged

@@ -15,7 +15,7 @@ from flangeye.units import Angle, AngularSpeed, Duration, Length, Speed, param
 from flangeye_plugins.weld.joint import JointKind
 from flangeye_plugins.weld.path import Path
 
-Mode = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
+ControllerChoice = Annotated[str | BoundPart, Choose("controller", words=("tactile", "vision"))]
 """Follow by touch, by the plan alone, or by a plugin's controller."""
 
 INSIDE = 1.5e-3
@@ -173,7 +173,7 @@ class WeldTactileParams(Following):
     arc: Annotated[BoundPart, Choose("arc")] | None = None
     """The power source, for example {ur_digital: {host: 192.168.1.10, output: 3}}: it is switched
     as the torch's bound allows, and goes off with any stop of the arm."""
-    mode: Mode = "tactile"
+    mode: ControllerChoice = "tactile"
     """tactile: follow the seam by touch. For comparison: vision follows the plan alone and touches
     nothing; any other name is that of a controller plugin."""
     leg: int | None = Field(None, ge=1)

@@ -87,7 +87,9 @@ def test_an_arm_reaches_what_is_planned_for_it(robot: str) -> None:
         [[0, -1, 0, 0.6], [-1, 0, 0, -0.0125], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=float
     )
     reach = Reach(model, scanner, base_T_camera, 0.0375)
-    site = Site(np.array([0.6, -0.0125, 0.3]), base_T_camera[:3, 3], reach.facing, reach.joints)
+    site = Site(
+        np.array([0.6, -0.0125, 0.3]), base_T_camera[:3, 3], reach.facing_rotation, reach.joints
+    )
     plan = grid(site, rng(3), params=GridParams(counts=(2, 2, 2)))
     assert len(plan.poses) >= 6
     for pose, joints, _ in plan.poses:

@@ -20,20 +20,21 @@ pytestmark = pytest.mark.realtime
 
 pytest.importorskip("rtde_control")
 
-LANES = 2
+EMULATORS = 2
 """Controllers at work at the same time: most of what a failure takes is waiting."""
 
 
 @pytest.fixture(scope="module")
-def lanes() -> Iterator[Any]:
-    with ExitStack() as stack, ThreadPoolExecutor(LANES) as pool:
+def emulators() -> Iterator[Any]:
+    with ExitStack() as stack, ThreadPoolExecutor(EMULATORS) as pool:
         yield [
-            stack.enter_context(process) for process in pool.map(lambda _: Process(), range(LANES))
+            stack.enter_context(process)
+            for process in pool.map(lambda _: Process(), range(EMULATORS))
         ]
 
 
 HUNDRED = pytest.param(100, marks=pytest.mark.slow)
-TIMES = pytest.mark.parametrize("times", [LANES, HUNDRED])
+TIMES = pytest.mark.parametrize("times", [EMULATORS, HUNDRED])
 
 downwards = np.array([0, 0, -0.05, 0, 0, 0])
 numbers = count()
@@ -146,14 +147,14 @@ def answers(host):
         return None
 
 
-def fail_often(lanes, fault, times):
+def fail_often(emulators, fault, times):
     """Let every controller fail its share of the times; return what was seen."""
 
-    def in_lane(process):
-        return [fail(process, fault, next(numbers)) for _ in range(times // LANES)]
+    def of_one(process):
+        return [fail(process, fault, next(numbers)) for _ in range(times // EMULATORS)]
 
-    with ThreadPoolExecutor(LANES) as pool:
-        seen = [line for lane in pool.map(in_lane, lanes) for line in lane]
+    with ThreadPoolExecutor(EMULATORS) as pool:
+        seen = [line for lines in pool.map(of_one, emulators) for line in lines]
     assert len(seen) == times
     return seen
 
@@ -171,8 +172,8 @@ LOCAL = "it is in local control: choose Remote Control at the top right of the p
 
 @TIMES
 @pytest.mark.parametrize("fault", LOSSES)
-def test_a_controller_that_is_lost_is_noticed(lanes: Any, fault: str, times: Any) -> None:
-    for line in fail_often(lanes, fault, times):
+def test_a_controller_that_is_lost_is_noticed(emulators: Any, fault: str, times: Any) -> None:
+    for line in fail_often(emulators, fault, times):
         assert any(words in line for words in LOST), line
 
 
@@ -186,9 +187,9 @@ def test_a_controller_that_is_lost_is_noticed(lanes: Any, fault: str, times: Any
     ],
 )
 def test_a_controller_that_stops_says_why(
-    lanes: Any, fault: str, said: tuple[Any, ...], times: Any
+    emulators: Any, fault: str, said: tuple[Any, ...], times: Any
 ) -> None:
-    for line in fail_often(lanes, fault, times):
+    for line in fail_often(emulators, fault, times):
         assert any(words in line for words in said), line
 
 
@@ -203,8 +204,10 @@ def test_a_controller_that_stops_says_why(
         ("latency=100 ms", "ms to it and back, at most 80 ms are allowed: connect it by cable"),
     ],
 )
-def test_a_controller_that_is_not_ready_is_not_opened(lanes: Any, fault: str, message: str) -> None:
-    process = lanes[0]
+def test_a_controller_that_is_not_ready_is_not_opened(
+    emulators: Any, fault: str, message: str
+) -> None:
+    process = emulators[0]
     process.control.reset()
     process.control.fault(fault)
     with in_time(), pytest.raises(DeviceError) as error:
@@ -214,8 +217,8 @@ def test_a_controller_that_is_not_ready_is_not_opened(lanes: Any, fault: str, me
     assert message in str(error.value)
 
 
-def test_an_arm_without_power_is_not_opened(lanes: Any) -> None:
-    process = lanes[0]
+def test_an_arm_without_power_is_not_opened(emulators: Any) -> None:
+    process = emulators[0]
     process.control.reset()
     process.control.fault("emergency-stop")
     release_emergency_stop(process.host)
@@ -233,8 +236,8 @@ def release_emergency_stop(host):
 
 
 @pytest.mark.parametrize("move", range(3))
-def test_a_stopped_arm_takes_no_command(lanes: Any, move: int) -> None:
-    process = lanes[0]
+def test_a_stopped_arm_takes_no_command(emulators: Any, move: int) -> None:
+    process = emulators[0]
     process.control.reset()
     with open_ur(process.host) as robot:
         process.control.fault("protective-stop")
@@ -246,8 +249,8 @@ def test_a_stopped_arm_takes_no_command(lanes: Any, move: int) -> None:
     )
 
 
-def test_after_every_failure_the_next_driver_finds_a_working_arm(lanes: Any) -> None:
-    process = lanes[0]
+def test_after_every_failure_the_next_driver_finds_a_working_arm(emulators: Any) -> None:
+    process = emulators[0]
     for fault, said in (("drop", ""), ("freeze", ""), ("program-stop", "its program was stopped")):
         assert said in fail(process, fault, 0)
         process.control.reset()
@@ -255,9 +258,9 @@ def test_after_every_failure_the_next_driver_finds_a_working_arm(lanes: Any) -> 
             assert robot.state().mode == "ready"
 
 
-def test_the_control_channel_lives_on(lanes: Any) -> None:
+def test_the_control_channel_lives_on(emulators: Any) -> None:
     """Else the hundred times above would prove nothing."""
-    with EmulatorControl(lanes[0].host) as control:
+    with EmulatorControl(emulators[0].host) as control:
         control.fault("die")
         assert control.truth().speed == 0.0
         control.reset()

@@ -36,7 +36,7 @@ def shown():
     base_T_camera = CameraPose().matrix
     reach = Reach(UR5E, PHOXI, base_T_camera, UR5E.flange.wrist / 2)
     middle = middle_of_view(PHOXI, base_T_camera)
-    facing = reach.facing(middle)
+    facing = reach.facing_rotation(middle)
     assert facing is not None
     return reach.joints(rigid(facing, middle))
 

@@ -20,7 +20,7 @@ from flangeye.types import (
     WorkpieceScan,
 )
 from flangeye.types.geometry import rigid, rotation_from_rpy
-from flangeye_plugins.seam.ends import last_in_lanes
+from flangeye_plugins.seam.ends import last_in_strips
 from flangeye_plugins.seam.joint import JointParams, seam_joint
 from tests.plugins.seam.raycast import JOINTS, LENGTH, MM, WIDE, Plate, box, prism, scan_of, seen_by
 from tests.plugins.seam.scenes import BASE_T_CAMERA, hand_eye, scanned
@@ -247,7 +247,7 @@ def test_too_few_points_about_the_line_are_refused() -> None:
 
 def test_a_surface_without_points_has_no_lanes() -> None:
     empty = np.zeros(0)
-    last, more = last_in_lanes(empty, empty, 0.3 * MM)
+    last, more = last_in_strips(empty, empty, 0.3 * MM)
     assert len(last) == len(more) == 0
 
 

@@ -23,7 +23,12 @@ from flangeye_plugins.weld.frame import WorkSurface
 from flangeye_plugins.weld.passes import MultiPassController
 from flangeye_plugins.weld.path import Path
 from flangeye_plugins.weld.resuming import RUN_IN, controller_of, restart, resume_point_of
-from flangeye_plugins.weld.settings import Following, Mode, PassParams, WeldTactileParams
+from flangeye_plugins.weld.settings import (
+    ControllerChoice,
+    Following,
+    PassParams,
+    WeldTactileParams,
+)
 from tests.plugins.weld import bench
 from tests.plugins.weld.bench import DISTANCE, circle, straight
 from tests.plugins.weld.cell import planned, run, true_line
@@ -158,7 +163,7 @@ def test_later_passes_follow_a_weld_by_touch_alone() -> None:
     for mode, asked, kind in (
         ("tactile", settings, MultiPassController), ("vision", settings, Follower), ("tactile", alone, Follower),
     ):  # fmt: skip
-        given: Mode = mode
+        given: ControllerChoice = mode
         controller = controller_of(WeldTask(plan, ModelPrior(DISTANCE), asked), given)
         assert type(controller) is kind and controller.mode == mode
 

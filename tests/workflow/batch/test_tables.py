@@ -14,7 +14,7 @@ import pytest
 
 from flangeye.files.paths import storage_at
 from flangeye.workflow.batch import _write_results
-from flangeye.workflow.batch.dataset import Dataset, Kind, Ledger, columns_of, row_of
+from flangeye.workflow.batch.dataset import ColumnType, Dataset, Ledger, columns_of, row_of
 from flangeye.workflow.batch.outcome import SessionOutcome
 from flangeye.workflow.batch.page import drawings_of, write_page
 from flangeye.workflow.batch.page import render as rendered
@@ -35,7 +35,7 @@ def outcome(rms=3e-4, **more):
                    report=report, **more)  # fmt: skip
 
 
-def columns(entries: Any) -> dict[str, Kind]:
+def columns(entries: Any) -> dict[str, ColumnType]:
     paths = entries[0][0].varied
     return columns_of({path: [session.varied[path] for session, _ in entries] for path in paths})
 

@@ -22,13 +22,13 @@ from flangeye.types.geometry import (
     stack_rows,
 )
 
-Triple = tuple[Floats, Floats, Floats]
+RotationTriple = tuple[Floats, Floats, Floats]
 
 FEWEST_KRONECKER = 12
 """Poses from which the 90 products of the rotations' entries follow."""
 
 
-def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
+def kronecker(a: Floats, b: Floats, c: Floats) -> RotationTriple:
     """Return X, Y, Z (4, 4) by linear least squares, from at least 12 poses each (N, 4, 4).
 
     ``A X B`` is linear in the 9 entries of X, ``Y C Z`` in the 81 products of those of Y and Z
@@ -49,7 +49,7 @@ def kronecker(a: Floats, b: Floats, c: Floats) -> Triple:
     return with_translations((a, b, c), (x, y, z))
 
 
-def best_rotations(given: Triple, rng: np.random.Generator) -> Triple:
+def best_rotations(given: RotationTriple, rng: np.random.Generator) -> RotationTriple:
     """Return the rotations X, Y, Z (3, 3) with the least error over many random starts.
 
     All starts alternate for a few rounds; the best ones continue by Gauss-Newton, which needs a
@@ -65,7 +65,7 @@ def best_rotations(given: Triple, rng: np.random.Generator) -> Triple:
     return _settled(given, (x[on], y[on], z[on]))
 
 
-def _settled(given: Triple, near: Triple) -> Triple:
+def _settled(given: RotationTriple, near: RotationTriple) -> RotationTriple:
     """Return the best of rotations (K, 3, 3) after a few Gauss-Newton steps, each (3, 3)."""
     (a, b, c), (x, y, z) = given, near
     steps = 10  # of Newton's
@@ -87,7 +87,9 @@ def _settled(given: Triple, near: Triple) -> Triple:
     return x[best], y[best], z[best]
 
 
-def alternate(given: Triple, starts: Triple, rounds: int = 3000) -> tuple[Triple, Floats]:
+def alternate(
+    given: RotationTriple, starts: RotationTriple, rounds: int = 3000
+) -> tuple[RotationTriple, Floats]:
     """Return rotations X, Y, Z (..., 3, 3) from any starts, and their errors (...) [rad rms].
 
     Each in turn is the rotation that fits best given the other two (Procrustes); the sum of
@@ -124,13 +126,13 @@ def _third(form: Floats, first: Floats, second: Floats) -> Floats:
     return np.asarray((products.reshape(*lead, -1, 81) @ form).reshape(shape))
 
 
-def random_rotations(rng: np.random.Generator, count: tuple[int, ...] = ()) -> Triple:
+def random_rotations(rng: np.random.Generator, count: tuple[int, ...] = ()) -> RotationTriple:
     """Return three random rotations (*count, 3, 3), uniformly distributed."""
     x, y, z = (rotation_from_quaternion(q) for q in rng.standard_normal((3, *count, 4)))
     return x, y, z
 
 
-def with_translations(given: Triple, rotations: Triple) -> Triple:
+def with_translations(given: RotationTriple, rotations: RotationTriple) -> RotationTriple:
     """Return X, Y, Z (4, 4): the translations fit the rotations by linear least squares.
 
     ``R_A t_X - R_Y R_C t_Z - t_Y = R_Y t_C - t_A - R_A R_X t_B`` for every pose.
@@ -149,7 +151,7 @@ def with_translations(given: Triple, rotations: Triple) -> Triple:
     return rigid(x, found[:3]), rigid(y, found[3:6]), rigid(z, found[6:])
 
 
-def two_steps(a: Floats, b: Floats, c: Floats) -> Triple:
+def two_steps(a: Floats, b: Floats, c: Floats) -> RotationTriple:
     """Return X, Y, Z (4, 4) by the paper's equation (6), from poses each (N, 4, 4).
 
     (a) The poses at which the second arm rests are eye-in-hand for the first; (b) those at which

@@ -30,12 +30,12 @@ from flangeye.types import (
 )
 from flangeye.types.geometry import hat, invert, rotation_log
 
-Poses = Sequence[Observation]
+PosesOfCapture = Sequence[Observation]
 """One capture, once for each pose that explains its scan."""
 
 
 def disambiguated(
-    cell: Cell, sure: Poses, held: Sequence[Poses], last: bool
+    cell: Cell, sure: PosesOfCapture, held: Sequence[PosesOfCapture], last: bool
 ) -> list[Observation | None]:
     """Return for each capture the pose that the others support; None if it stays ambiguous.
 
@@ -52,7 +52,7 @@ def disambiguated(
     return told
 
 
-def ambiguous(poses: Poses) -> Rejected:
+def ambiguous(poses: PosesOfCapture) -> Rejected:
     """Return the rejection of a capture that several poses explain: how they differ, what to do."""
     why = (
         f"{len(poses)} poses of the target explain the scan, and the arm's motion does not show "
@@ -78,7 +78,9 @@ def ambiguous(poses: Poses) -> Rejected:
     )
 
 
-def _supported(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observation | None]:
+def _supported(
+    cell: Cell, sure: PosesOfCapture, held: Sequence[PosesOfCapture]
+) -> list[Observation | None]:
     if not held:
         return []
     each = [*held, *([o] for o in sure if isinstance(o.feature, type(held[0][0].feature)))]
@@ -95,7 +97,7 @@ def _supported(cell: Cell, sure: Poses, held: Sequence[Poses]) -> list[Observati
     return [_likeliest(poses, costs[own == k]) for k, poses in enumerate(held)]
 
 
-def _apart(cell: Cell, every: Poses) -> Floats:
+def _apart(cell: Cell, every: PosesOfCapture) -> Floats:
     """Return (M, M) squared Mahalanobis distances of poses; NaN for other cameras or targets."""
     unknown = cell.unknown_frames
     at_once = [Transform(cell.frames[n].parent, n, np.eye(4)) for n in unknown]
@@ -116,7 +118,7 @@ def _apart(cell: Cell, every: Poses) -> Floats:
     return np.where(same, out, np.nan)
 
 
-def _features(poses: Poses) -> list[PoseFeature]:
+def _features(poses: PosesOfCapture) -> list[PoseFeature]:
     return [pose.feature for pose in poses if isinstance(pose.feature, PoseFeature)]
 
 
@@ -175,7 +177,7 @@ def _costs(nearest: Floats, starts: Indices) -> Floats:
     return np.asarray(np.nansum(np.log1p(nearest / scale), axis=1))
 
 
-def _likeliest(poses: Poses, costs: Floats) -> Observation | None:
+def _likeliest(poses: PosesOfCapture, costs: Floats) -> Observation | None:
     first, second = np.argsort(costs, kind="stable")[:2]
     # Times by which a pose must be likelier than any other
     odds = 1000.0

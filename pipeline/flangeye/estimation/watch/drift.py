@@ -39,7 +39,7 @@ NO_NORMAL = 1.0
 """Variance [rad^2] of a tilt that was not measured: no information."""
 
 
-State = Literal["OK", "DEGRADED", "MOVED"]
+DriftState = Literal["OK", "DEGRADED", "MOVED"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ class DriftVerdict:
         statistic: Test statistic over its threshold; above 1 something moved.
     """
 
-    state: State
+    state: DriftState
     motion: Floats
     covariance: Floats
     shift: float
@@ -238,7 +238,7 @@ def verdict(checks: Information, prior: Prior, corners: Floats, test: DriftTest)
     shift = largest_shift(motion, corners)
     # Larger than its limit with 95 %, one-sided
     surely = shift - 1.64 * _deviation(motion, covariance, corners)
-    drifted: State = "MOVED" if surely > test.limit else "DEGRADED"
+    drifted: DriftState = "MOVED" if surely > test.limit else "DEGRADED"
     state = drifted if surely > test.limit / 2 else "OK"
     since = None if state == "OK" else _began(checks, corners, prior, test)
     return DriftVerdict(state, motion, covariance, shift, since, found[0])

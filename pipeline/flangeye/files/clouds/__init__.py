@@ -66,8 +66,8 @@ def _not_among(depth: float, others: Points) -> bool:
     return bool(others.size) and bool((others * ahead > 0).all() and depth * ahead <= 0)
 
 
-LengthUnit = Literal["m", "mm", "cm", "in"]
-PER_METRE: Mapping[LengthUnit, float] = {"m": 1, "mm": 1000, "cm": 100, "in": 1 / 0.0254}
+FileUnit = Literal["m", "mm", "cm", "in"]
+PER_METRE: Mapping[FileUnit, float] = {"m": 1, "mm": 1000, "cm": 100, "in": 1 / 0.0254}
 """Number of each unit in a metre."""
 
 CLOUD_FILES: Mapping[str, Callable[[Path], PointTable]] = {
@@ -109,7 +109,7 @@ CONVERSIONS: Mapping[str, str] = {
 
 def read_cloud(
     path: Path,
-    unit: LengthUnit = "m",
+    unit: FileUnit = "m",
     told: Callable[[str], None] | None = None,
     from_viewpoint: bool = False,
 ) -> PointCloud:
@@ -162,7 +162,7 @@ def check_cloud_file(path: Path) -> int:
     return math.prod(_open(path).shape)
 
 
-def write_cloud(path: Path, cloud: PointCloud, unit: LengthUnit = "m") -> None:
+def write_cloud(path: Path, cloud: PointCloud, unit: FileUnit = "m") -> None:
     """Write a cloud as binary PCD, organised if it is; missing points stay missing.
 
     Args:

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from flangeye.files.clouds.table import (
+    ArrayShape,
     BinaryTable,
     CompressedTable,
     Points,
     PointTable,
-    Shape,
     TextTable,
     axes_of,
     count_of,
@@ -24,7 +24,7 @@ from flangeye.files.clouds.table import (
 )
 from flangeye.types.geometry import rotation_from_quaternion
 
-Header = Mapping[str, list[str]]
+PcdHeader = Mapping[str, list[str]]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def open_pcd(path: Path) -> PointTable:
     refuse(path, f"its header states DATA {encoding}; known: ascii, binary, binary_compressed")
 
 
-def _viewpoint(path: Path, header: Header) -> Viewpoint | None:
+def _viewpoint(path: Path, header: PcdHeader) -> Viewpoint | None:
     """Return the viewpoint; None for the identity, or where there is none."""
     words = header.get("VIEWPOINT")
     if not words or list(map(float, filter(_is_number, words))) == [0, 0, 0, 1, 0, 0, 0]:
@@ -98,14 +98,14 @@ def _is_number(word: str) -> bool:
         return False
 
 
-def _words(path: Path, header: Header, key: str) -> list[str]:
+def _words(path: Path, header: PcdHeader, key: str) -> list[str]:
     words = header.get(key)
     if not words:
         refuse(path, f"its PCD header has no {key}")
     return words
 
 
-def _shape(path: Path, header: Header) -> Shape:
+def _shape(path: Path, header: PcdHeader) -> ArrayShape:
     width = count_of(path, "WIDTH", _words(path, header, "WIDTH")[0])
     height = count_of(path, "HEIGHT", _words(path, header, "HEIGHT")[0])
     points = count_of(path, "POINTS", (header.get("POINTS") or [str(width * height)])[0])
@@ -114,7 +114,7 @@ def _shape(path: Path, header: Header) -> Shape:
     return (height, width) if height > 1 else (width,)
 
 
-def _counts(path: Path, header: Header, fields: int) -> list[int]:
+def _counts(path: Path, header: PcdHeader, fields: int) -> list[int]:
     words = header.get("COUNT") or ["1"] * fields
     if len(words) != fields:
         refuse(path, f"its header names {fields} fields, but gives {len(words)} COUNT")
@@ -122,7 +122,7 @@ def _counts(path: Path, header: Header, fields: int) -> list[int]:
 
 
 def _record(
-    path: Path, header: Header, counts: list[int], axes: tuple[int, int, int]
+    path: Path, header: PcdHeader, counts: list[int], axes: tuple[int, int, int]
 ) -> np.dtype[np.void]:
     sizes, kinds = _words(path, header, "SIZE"), _words(path, header, "TYPE")
     if not len(sizes) == len(kinds) == len(counts):

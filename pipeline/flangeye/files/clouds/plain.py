@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from flangeye.errors import StageError
 from flangeye.files.clouds.table import (
+    ArrayShape,
     Points,
     PointTable,
-    Shape,
     TextTable,
     axes_of,
     count_of,
@@ -102,21 +102,21 @@ def _axes_last(array: NDArray[Any]) -> NDArray[Any] | None:
     return np.moveaxis(array, 0, -1) if _is_axes_first(array.shape) else None
 
 
-def _is_axes_first(shape: Shape) -> bool:
+def _is_axes_first(shape: ArrayShape) -> bool:
     return len(shape) in (2, 3) and 3 <= shape[0] <= POINT_NUMBERS < shape[-1]
 
 
-def _is_wide(shape: Shape) -> bool:
+def _is_wide(shape: ArrayShape) -> bool:
     return len(shape) in (2, 3) and 3 <= shape[-1] <= POINT_NUMBERS
 
 
-def _may_be_points(shape: Shape) -> bool:
+def _may_be_points(shape: ArrayShape) -> bool:
     """Return whether an array of unknown name may be points, and not poses or a camera's matrix."""
     rows = math.prod(shape[:-1]) > POINT_NUMBERS and (len(shape) == 2 or shape[1] > 4)
     return rows and shape[-1] in (3, 4, 6)
 
 
-def npy_shape(path: Path) -> Shape:
+def npy_shape(path: Path) -> ArrayShape:
     """Return the shape of the array of numbers in a .npy file.
 
     Raises:
@@ -196,7 +196,7 @@ def _holds_numbers(file: IO[bytes]) -> bool:
         return True
 
 
-def _npy_header(path: Path, records: bool = False) -> tuple[Shape, tuple[str, ...]]:
+def _npy_header(path: Path, records: bool = False) -> tuple[ArrayShape, tuple[str, ...]]:
     read_head(path)
     with path.open("rb") as file:
         return _shape_in(path, file, path.stat().st_size, records)
@@ -204,7 +204,7 @@ def _npy_header(path: Path, records: bool = False) -> tuple[Shape, tuple[str, ..
 
 def _shape_in(
     path: Path | str, file: IO[bytes], size: int, records: bool = False
-) -> tuple[Shape, tuple[str, ...]]:
+) -> tuple[ArrayShape, tuple[str, ...]]:
     """Return the shape that a header states, and the names of the fields of records.
 
     The shape is checked against the size of the whole [bytes].
@@ -227,7 +227,7 @@ def _shape_in(
     return tuple(shape), fields
 
 
-def _header(file: IO[bytes]) -> tuple[Shape, np.dtype[Any]]:
+def _header(file: IO[bytes]) -> tuple[ArrayShape, np.dtype[Any]]:
     version = npy_format.read_magic(file)
     read = (
         npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0

@@ -136,7 +136,7 @@ def is_row(line: str) -> bool:
     return not line.isspace() and not line.lstrip().startswith(("#", "//", "%"))
 
 
-Shape = tuple[int, ...]
+ArrayShape = tuple[int, ...]
 Points = NDArray[np.float32]
 
 
@@ -151,7 +151,7 @@ class PointTable(ABC):
     """
 
     path: Path
-    shape: Shape
+    shape: ArrayShape
     viewpoint: Any = field(default=None, kw_only=True)
 
     def check(self) -> None:  # noqa: B027  some have nothing left to check

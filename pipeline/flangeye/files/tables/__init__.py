@@ -28,11 +28,11 @@ from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import read_any_text
 from flangeye.files.scans import natural, partners
 from flangeye.files.tables.table import (
-    Cell,
+    CellValue,
     Column,
-    Row,
     Rows,
     Table,
+    TableRow,
     entry_of_list,
     number_of,
     record_of,
@@ -44,7 +44,7 @@ from flangeye.types.pose_formats import CONVENTIONS
 
 __all__ = [
     "DOCUMENT_READERS",
-    "Cell",
+    "CellValue",
     "Column",
     "Table",
     "document_of",
@@ -290,7 +290,7 @@ def _beside(tables: Sequence[Table]) -> Table:
         for table, heading in zip(tables, headings, strict=True)
         for name in heading
     ]
-    rows: list[Row] = [
+    rows: list[TableRow] = [
         (each[0][0], tuple(cell for _, cells in each for cell in cells))
         for each in zip(*(table.rows for table in tables), strict=True)
     ]
@@ -351,7 +351,7 @@ class TextBlock:
         marked: Whether a mark, not blanks, stands between the cells.
     """
 
-    rows: list[Row] = field(default_factory=list)
+    rows: list[TableRow] = field(default_factory=list)
     heading: tuple[str, ...] = ()
     title: str = ""
     above: str = ""
@@ -435,7 +435,7 @@ def _unbroken(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
             begun = ""
 
 
-def _list_in(cell: Cell) -> tuple[str, ...]:
+def _list_in(cell: CellValue) -> tuple[str, ...]:
     """Return the numbers of a list in one cell; empty if the cell holds no list."""
     text = str(cell).strip()
     words = re.split(r"[\s,;\[\]()]+", text.strip("[]() ")) if text[:1] in ("[", "(") else []

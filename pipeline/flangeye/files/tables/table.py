@@ -18,8 +18,8 @@ from flangeye.types import Floats
 
 Column = str | int
 """A column by its name in the heading, or by its number from 1."""
-Cell = str | float
-Row = tuple[str, tuple[Cell, ...]]
+CellValue = str | float
+TableRow = tuple[str, tuple[CellValue, ...]]
 """Location of a row, with which messages begin, and its cells."""
 
 
@@ -36,7 +36,7 @@ class Rows(NamedTuple):
     """
 
     heading: tuple[str, ...]
-    rows: Sequence[Row]
+    rows: Sequence[TableRow]
     part: str = ""
     names: Sequence[str] = ()
     convention: str | None = None
@@ -59,7 +59,7 @@ class Table:
     name: str
     file: Path
     heading: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     files: tuple[Path, ...]
     names: tuple[str, ...] = ()
     convention: str | None = None
@@ -138,7 +138,7 @@ def entry_of_list(name: str) -> tuple[str, str] | None:
     return match and (match[1], match[2])
 
 
-def number_of(cell: Cell) -> float | None:
+def number_of(cell: CellValue) -> float | None:
     """Return the number in a cell, as spreadsheets and Fortran write it too; None for other text.
 
     It may have a decimal comma, marks between thousands (1.234,5 and 1,234.5), a typographer's
@@ -282,7 +282,7 @@ def _lists(name: str, data: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 
 def _columns(where: Callable[[int], str], lists: Mapping[str, Any]) -> Rows:
-    columns: dict[str, Sequence[Cell]] = {}
+    columns: dict[str, Sequence[CellValue]] = {}
     for name, value in lists.items():
         shape = _shape(value)
         if shape:
@@ -312,7 +312,7 @@ def table_of(records: Sequence[tuple[str, Any]]) -> Rows:
     """Return the columns of all records, in the order of their first one, and a row each."""
     cells = [(where, _cells(where, record)) for where, record in records]
     columns = list(dict.fromkeys(name for _, found in cells for name in found))
-    rows: list[Row] = [
+    rows: list[TableRow] = [
         (where, tuple(found.get(name, "") for name in columns)) for where, found in cells
     ]
     return Rows(_heading(columns), rows)
@@ -325,8 +325,8 @@ def _heading(columns: Sequence[str]) -> tuple[str, ...]:
     return tuple(columns) if named else ()
 
 
-def _cells(where: str, record: Any) -> dict[str, Cell]:
-    found: dict[str, Cell] = {}
+def _cells(where: str, record: Any) -> dict[str, CellValue]:
+    found: dict[str, CellValue] = {}
     for name, value in _leaves(record):
         if len(found) == RECORD_VALUES:
             raise StageError(f"{where}: has more than {RECORD_VALUES} values, too many for a pose")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Kind = str
+ColumnType = str
 """``string``, ``int64`` or ``double``, as Arrow calls them."""
 
 FOLDER = "sessions.parquet"
@@ -33,7 +33,7 @@ FILE_SESSIONS = 10_000
 """Sessions in a file at most."""
 
 
-def columns_of(varied: Mapping[str, Sequence[str]]) -> dict[str, Kind]:
+def columns_of(varied: Mapping[str, Sequence[str]]) -> dict[str, ColumnType]:
     """Return the types of the table's columns by name.
 
     Args:
@@ -44,7 +44,7 @@ def columns_of(varied: Mapping[str, Sequence[str]]) -> dict[str, Kind]:
     return {name: _kind(name, varied) for name in names}
 
 
-def _kind(name: str, varied: Mapping[str, Sequence[str]]) -> Kind:
+def _kind(name: str, varied: Mapping[str, Sequence[str]]) -> ColumnType:
     if name in varied:
         kinds = {type(parse_value(text, name)) for text in varied[name]}
         return "int64" if kinds == {int} else "double" if kinds <= {int, float} else "string"
@@ -53,7 +53,9 @@ def _kind(name: str, varied: Mapping[str, Sequence[str]]) -> Kind:
     return "int64" if name in ("seed", "used", "captures") else "double"
 
 
-def row_of(session: BatchSession, outcome: SessionOutcome, columns: Mapping[str, Kind]) -> Row:
+def row_of(
+    session: BatchSession, outcome: SessionOutcome, columns: Mapping[str, ColumnType]
+) -> Row:
     """Return a session's row."""
     varied = {
         name: text if columns[name] == "string" else parse_value(text, name)
@@ -95,7 +97,7 @@ class Ledger:
 class Dataset:
     """The rows of a batch in its folder."""
 
-    def __init__(self, place: Storage, columns: Mapping[str, Kind]) -> None:
+    def __init__(self, place: Storage, columns: Mapping[str, ColumnType]) -> None:
         import pyarrow as pa
 
         self._place = place

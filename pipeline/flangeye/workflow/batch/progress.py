@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flangeye.files.remote import is_url
 from flangeye.files.words import printable
-from flangeye.workflow.batch.dataset import Kind, Row
+from flangeye.workflow.batch.dataset import ColumnType, Row
 from flangeye.workflow.batch.outcome import ACCEPTED, STATUSES, SessionOutcome, Status
 
 if TYPE_CHECKING:
@@ -63,7 +63,9 @@ class Tally:
     # Sessions, and variants, in the page's tables, and about as many dots in its plots.
     most_listed: ClassVar[int] = 1000
 
-    def __init__(self, columns: Mapping[str, Kind], varied: Sequence[str], about: int) -> None:
+    def __init__(
+        self, columns: Mapping[str, ColumnType], varied: Sequence[str], about: int
+    ) -> None:
         self.columns, self.varied = tuple(columns), tuple(varied)
         self.total, self.seconds, self.recipe = 0, 0.0, "nothing"
         self.told: set[str] = set()

@@ -15,7 +15,7 @@ from flangeye.files.paths import Storage, storage_at
 from flangeye.files.remote import archive_at, is_url, results_at
 from flangeye.plugin.registry import Registry, load_registry
 from flangeye.types import ArchivePath
-from flangeye.workflow.batch.dataset import Dataset, Kind, row_of
+from flangeye.workflow.batch.dataset import ColumnType, Dataset, row_of
 from flangeye.workflow.batch.outcome import (
     ACCEPTED,
     FINISHED,
@@ -69,7 +69,7 @@ class Job:
     out: str
     report: bool
     software: Software
-    columns: Mapping[str, Kind]
+    columns: Mapping[str, ColumnType]
     start: str = field(default_factory=lambda: secrets.token_hex(4))
 
     @cached_property

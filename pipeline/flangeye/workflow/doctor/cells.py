@@ -47,11 +47,11 @@ from flangeye.workflow.recipe.load import Recipe, parse_recipe
 from flangeye.workflow.run.folder import recipe_of_log
 from flangeye.workflow.run.runner import Runner
 
-Keys = tuple[Hashable, ...]
-Changes = Mapping[Keys, Any]
+YamlPath = tuple[Hashable, ...]
+Changes = Mapping[YamlPath, Any]
 """Changed values in a recipe's data, by their path of keys."""
 
-Table = Mapping[str, Any]
+ReaderTable = Mapping[str, Any]
 """Parameters of one of the tables that ``reader.cell`` reads."""
 
 
@@ -89,7 +89,7 @@ class CellSession:
     tables: Path | None
 
     @property
-    def first(self) -> tuple[Keys, Mapping[str, Any]]:
+    def first(self) -> tuple[YamlPath, Mapping[str, Any]]:
         """Path of the first step's parameters in the recipe, and their values."""
         ((name, params),) = self._data["steps"][0].items()
         return ("steps", 0, name), params
@@ -233,7 +233,7 @@ def suspicions(session: CellSession) -> Iterator[Suspicion]:
     """Yield each mistake that may have been made, mended."""
     if session.tables is not None:
         above, params = session.first
-        at: Keys = (*above, "reader", "cell")
+        at: YamlPath = (*above, "reader", "cell")
         given = params["reader"]["cell"]
         yield from _of_tables(at, given)
         yield from _of_axes(at, given.get("axes", {}), session.cell)
@@ -241,7 +241,7 @@ def suspicions(session: CellSession) -> Iterator[Suspicion]:
     yield from _of_mountings(session.cell)
 
 
-def _of_tables(at: Keys, given: Mapping[str, Any]) -> Iterator[Suspicion]:
+def _of_tables(at: YamlPath, given: Mapping[str, Any]) -> Iterator[Suspicion]:
     """Yield tables of poses read in another way: each alone, those of all cameras, and all."""
     arms = {(*at, "arms", name): table for name, table in given.get("arms", {}).items()}
     seen = {(*at, "sightings", i): table for i, table in enumerate(given.get("sightings", ()))}
@@ -255,7 +255,7 @@ def _of_tables(at: Keys, given: Mapping[str, Any]) -> Iterator[Suspicion]:
     yield from _rotations("all poses", {**arms, **seen})
 
 
-def _read_otherwise(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspicion]:
+def _read_otherwise(whose: str, tables: Mapping[YamlPath, ReaderTable]) -> Iterator[Suspicion]:
     """Yield tables whose poses are inverted, in another unit, or have other rotations."""
     pose = _common(tables, "pose")
     if pose is not None and _common(tables, "rotation") != "point":
@@ -272,24 +272,24 @@ def _read_otherwise(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspic
     yield from _rotations(whose, tables)
 
 
-def _rotations(whose: str, tables: Mapping[Keys, Table]) -> Iterator[Suspicion]:
+def _rotations(whose: str, tables: Mapping[YamlPath, ReaderTable]) -> Iterator[Suspicion]:
     """Yield other conventions in which the rotations of these tables may be written."""
     rotation, angle = _common(tables, "rotation"), _common(tables, "angle")
     for other in other_conventions(rotation, angle) if rotation is not None else ():
         was, fits = describe_rotation(rotation, angle), describe_rotation(*other)
-        changes: dict[Keys, Any] = {(*keys, "rotation"): other[0] for keys in tables}
+        changes: dict[YamlPath, Any] = {(*keys, "rotation"): other[0] for keys in tables}
         changes |= {(*keys, "angle"): other[1] for keys in tables if other[1]}
         what = f"the rotations of {whose} were read as {was}, and fit as {fits}"
         yield Suspicion("pose convention", what, changes)
 
 
-def _common(tables: Mapping[Keys, Table], key: str) -> Any:
+def _common(tables: Mapping[YamlPath, ReaderTable], key: str) -> Any:
     """Return the value that all tables state; None if they differ."""
     stated = {table.get(key) for table in tables.values()}
     return stated.pop() if len(stated) == 1 else None
 
 
-def _of_axes(at: Keys, tables: Mapping[str, Table], cell: Cell) -> Iterator[Suspicion]:
+def _of_axes(at: YamlPath, tables: Mapping[str, ReaderTable], cell: Cell) -> Iterator[Suspicion]:
     """Yield rails and positioners in another unit, or that move the other way."""
     for name, table in tables.items():
         for unit in {"m": ["mm"], "mm": ["m"], "rad": ["deg"], "deg": ["rad"]}[table["unit"]]:
@@ -297,7 +297,7 @@ def _of_axes(at: Keys, tables: Mapping[str, Table], cell: Cell) -> Iterator[Susp
             yield Suspicion("unit", what, {(*at, "axes", name, "unit"): unit})
         axis = cell.movers[name]
         if isinstance(axis, Axis):
-            section: Keys = ("cell", "positioners" if axis.turns else "rails", name)
+            section: YamlPath = ("cell", "positioners" if axis.turns else "rails", name)
             low, high = axis.travel
             unit = "rad" if axis.turns else "m"
             other = {
@@ -308,7 +308,7 @@ def _of_axes(at: Keys, tables: Mapping[str, Table], cell: Cell) -> Iterator[Susp
             yield Suspicion("reversed axis", what, other)
 
 
-def _exchanged(at: Keys, arms: Mapping[str, Table]) -> Iterator[Suspicion]:
+def _exchanged(at: YamlPath, arms: Mapping[str, ReaderTable]) -> Iterator[Suspicion]:
     """Yield changes that exchange the tables of two arms."""
     for one, two in combinations(arms, 2):
         tables = arms[one], arms[two]

@@ -23,7 +23,7 @@ from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import BoundPart, Part
 from flangeye.types import Floats, Mask, Motion
 
-Reader = str | Mapping[str, Any]
+ReaderLine = str | Mapping[str, Any]
 """A reader as a recipe writes it: its name, or its name and parameters."""
 
 Arms = Literal["both", "first", "second"]
@@ -83,7 +83,7 @@ class RecordedSession:
     robot: RobotModel | None = None
     motions: tuple[Motion, ...] | None = None
     reach: tuple[float, float] = (0.05, 5.0)
-    reader: Reader = "auto"
+    reader: ReaderLine = "auto"
     acquire: str = "acquire.archive"
     changes: Mapping[str, Any] = field(default_factory=dict)
     board: Mapping[str, Any] = field(default_factory=dict)
@@ -169,7 +169,9 @@ class RecordedSession:
         reader = {"corrected": {"reader": self.reader, **stated}}
         return replace(self, reader=reader, again=None)
 
-    def corrected(self, change: Change, arms: Arms = "both", **correction: Any) -> RecordedSession:
+    def corrected(
+        self, change: PoseChange, arms: Arms = "both", **correction: Any
+    ) -> RecordedSession:
         """Return the session with corrected poses, as read by ``reader.corrected``.
 
         Args:
@@ -286,7 +288,7 @@ class Finding:
 
 Findings = Iterable[Finding]
 ReadAgain = Callable[[Mapping[str, Any], Mapping[str, Any]], RecordedSession]
-Change = Callable[[Floats], Floats]
+PoseChange = Callable[[Floats], Floats]
 """Gives poses (N, 4, 4) as they should be."""
 
 

@@ -18,7 +18,7 @@ from flangeye import types as t
 from flangeye.errors import StageError
 from flangeye.files.recording import Archive, NotThisLayout, Recording, check_ids
 from flangeye.files.yaml_lines import parse_yaml
-from flangeye.models.boards import Kind
+from flangeye.models.boards import BoardKind
 from flangeye.models.cell import cell_of
 from flangeye.models.configuration import DEFAULT, LINK, Configuration
 from flangeye.models.robots import RobotModel
@@ -34,7 +34,7 @@ from flangeye.workflow.doctor.diagnosis import (
     Diagnosis,
     Finding,
     ReadAgain,
-    Reader,
+    ReaderLine,
     RecordedSession,
     as_yaml,
     examine,
@@ -387,7 +387,7 @@ def _board_of(recipe: Recipe) -> dict[str, Any]:
     asked = {"columns", "rows", "square", "marker", "dictionary"}
     for step in recipe.steps:
         kind = step.stage.name.removeprefix("fit.")
-        if kind in get_args(Kind):
+        if kind in get_args(BoardKind):
             stated = _given(step.params)
             return {"kind": kind, **{name: stated[name] for name in stated if name in asked}}
     return {}
@@ -411,7 +411,7 @@ def _limit(recipe: Recipe) -> float:
     )
 
 
-def _written(reader: Any) -> Reader:
+def _written(reader: Any) -> ReaderLine:
     """Return a reader as people write it: its name, with the parameters that were stated."""
     if not isinstance(reader, BoundPart):
         return "auto"

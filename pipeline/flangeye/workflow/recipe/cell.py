@@ -14,7 +14,7 @@ from flangeye.workflow.recipe.header import (
     CellArmSection,
     CellSection,
     Header,
-    Place,
+    PlaceChoice,
     PositionerSection,
     RailSection,
     StandingSection,
@@ -54,10 +54,10 @@ def cell_of(header: Header, model: Callable[[str], RobotModel], complain: Compla
     return Cell(_frames(section), movers, *ends).with_links(links)
 
 
-Mistake = tuple[tuple[Hashable, ...], str]
+CellMistake = tuple[tuple[Hashable, ...], str]
 
 
-def _beside(header: Header) -> Iterator[Mistake]:
+def _beside(header: Header) -> Iterator[CellMistake]:
     # Sections of a recipe with one camera and one target
     instead = ("robot", "second_robot", "configuration")
     given = [name for name in instead if name in header.model_fields_set]
@@ -65,7 +65,7 @@ def _beside(header: Header) -> Iterator[Mistake]:
         yield (), f"states all mountings itself; leave out {' and '.join(given)}"
 
 
-def _twice(section: CellSection) -> Iterator[Mistake]:
+def _twice(section: CellSection) -> Iterator[CellMistake]:
     seen: dict[str, str] = {}
     own = {f"{name}_base": f"what '{name}' stands on" for name, _ in _movers(section)}
     own |= {link.frame: f"a link of '{link.arm}'" for _, _, _, link in _on_links(section)}
@@ -77,7 +77,7 @@ def _twice(section: CellSection) -> Iterator[Mistake]:
         seen[name] = group
 
 
-def _standing(section: CellSection) -> Iterator[Mistake]:
+def _standing(section: CellSection) -> Iterator[CellMistake]:
     carriers = [BASE, *(name for name, _ in _movers(section))]
     lost = False
     for group, name, each in _entries(section):
@@ -104,7 +104,7 @@ def _standing(section: CellSection) -> Iterator[Mistake]:
 
 def _beyond_links(
     section: CellSection, movers: Mapping[str, RobotModel | Axis]
-) -> Iterator[Mistake]:
+) -> Iterator[CellMistake]:
     """Complain of links that the arms do not have."""
     for group, name, each, link in _on_links(section):
         arm = movers[each.on]
@@ -117,7 +117,7 @@ def _beyond_links(
             )
 
 
-def _at_one_place(section: CellSection) -> Iterator[Mistake]:
+def _at_one_place(section: CellSection) -> Iterator[CellMistake]:
     """Report two frames with the same given pose, one of which is probably unknown."""
     seen: dict[str, str] = {}
     for name, each in _movers(section):
@@ -169,7 +169,7 @@ def _frames(section: CellSection) -> dict[str, Frame]:
     return frames
 
 
-def place_of(given: Place) -> Floats | None:
+def place_of(given: PlaceChoice) -> Floats | None:
     """Return the (4, 4) pose given in a recipe; None if it is to be estimated."""
     if isinstance(given, PlaceParams):
         return given.matrix

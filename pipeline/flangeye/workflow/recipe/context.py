@@ -35,7 +35,7 @@ from flangeye.workflow.recipe.header import (
     FeatureSection,
     Header,
     LimitsSection,
-    Place,
+    PlaceChoice,
     RobotSection,
     ScannerSection,
     TargetSection,
@@ -232,7 +232,7 @@ def _configuration(header: Header, context: Context) -> Configuration:
     return Configuration(section.name, camera, target, stands)
 
 
-def _stands(place: Place) -> tuple[Triple, Triple] | None:
+def _stands(place: PlaceChoice) -> tuple[Triple, Triple] | None:
     if isinstance(place, PlaceParams):
         return place.position, place.rpy
     return ORIGIN if place == "known" else None

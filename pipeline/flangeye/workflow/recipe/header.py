@@ -9,7 +9,7 @@ from pydantic import Field, GetJsonSchemaHandler, field_validator, model_validat
 from pydantic_core import CoreSchema
 
 from flangeye.errors import StageError
-from flangeye.files.clouds import LengthUnit
+from flangeye.files.clouds import FileUnit
 from flangeye.models.robots import RobotModel
 from flangeye.motion.limits import MotionLimits
 from flangeye.plugin.stage import BoundPart, Choose, Params, PlaceParams
@@ -199,14 +199,14 @@ class TargetSection(NamedSection):
     links: dict[int, str] = Field({})
     """robot: meshes in metres, by the number of the joint in whose frame each is drawn (0: the
     base); default: those of the URDF."""
-    unit: LengthUnit | None = None
+    unit: FileUnit | None = None
     """Unit of the mesh's coordinates; found from its size if not given."""
     at: Literal["flange", "base", "unknown"] = "flange"
     """Frame in which the mesh is drawn; unknown: the body is fixed to the arm's flange, and its
     pose on the flange is estimated."""
 
 
-Place = Literal["known", "unknown"] | PlaceParams
+PlaceChoice = Literal["known", "unknown"] | PlaceParams
 
 
 class ConfigurationSection(RecipeSection):
@@ -217,7 +217,7 @@ class ConfigurationSection(RecipeSection):
     """Frame that carries the camera: base, flange, or link1, link2, … for eye-on-arm."""
     target: str | None = None
     """Frame that carries the target: flange, base or flange2."""
-    place: Place = "known"
+    place: PlaceChoice = "known"
     """Where the target is in that frame: known (at the origin, as the robot's own circles are),
     unknown (a marker), or its position and rpy."""
 
@@ -230,7 +230,7 @@ class MountedSection(RecipeSection):
 
     on: str = "base"
     """Frame that it is mounted on: base, or an arm, rail or positioner of the cell by name."""
-    place: Place = "known"
+    place: PlaceChoice = "known"
     """Pose in that frame: known (at its origin), unknown (to be estimated), or position and rpy."""
 
 
@@ -273,7 +273,7 @@ class StandingSection(NamedSection, MountedSection):
 
     link: int | None = Field(None, ge=1)
     """Which link of that arm it is on, from 1; its flange if not given."""
-    place: Place = "unknown"
+    place: PlaceChoice = "unknown"
     """Where it is on that: unknown (to be found), or known."""
 
 

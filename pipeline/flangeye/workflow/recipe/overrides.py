@@ -11,10 +11,10 @@ from flangeye.files.yaml_lines import parse_value
 from flangeye.plugin.registry import Lookup, Registry
 from flangeye.plugin.stage import KINDS, Params, Plugin
 
-Keys = tuple[Hashable, ...]
+YamlPath = tuple[Hashable, ...]
 
 
-def apply_override(data: dict[Hashable, Any], override: str) -> Keys:
+def apply_override(data: dict[Hashable, Any], override: str) -> YamlPath:
     """Set one value in a recipe's data, and return the path of its keys.
 
     A step is addressed by its index, its name or both: ``steps.2.inlier``, ``fit.rim.inlier`` and
@@ -32,7 +32,7 @@ def apply_override(data: dict[Hashable, Any], override: str) -> Keys:
     value = parse_value(text, f"--set {path}")
     index, below = _step(data, path)
     if index is None:
-        keys: Keys = tuple(path.split("."))
+        keys: YamlPath = tuple(path.split("."))
     elif below:
         keys = ("steps", index, _opened(data["steps"], index), *below.split("."))
     else:
@@ -42,7 +42,7 @@ def apply_override(data: dict[Hashable, Any], override: str) -> Keys:
     return keys
 
 
-def _put(data: Any, keys: Keys, value: Any, path: str) -> None:
+def _put(data: Any, keys: YamlPath, value: Any, path: str) -> None:
     node = data
     for key in keys[:-1]:
         # An override may open a section that the recipe leaves out

@@ -27,7 +27,7 @@ from flangeye.workflow.report.facts import (
     timings_of,
 )
 from flangeye.workflow.report.look import LOGO, SERIES, templates
-from flangeye.workflow.report.plot import Figure, layout2d, plain, round_up
+from flangeye.workflow.report.plot import FigureData, layout2d, plain, round_up
 from flangeye.workflow.report.residuals import errors_of, residual_figure
 from flangeye.workflow.report.space import workspace_drawing
 from flangeye.workflow.report.still import scene_of, still
@@ -147,7 +147,7 @@ class CheckDrawing:
     step: str
     summary: str
     picture: str = ""
-    figure: Figure | None = None
+    figure: FigureData | None = None
 
 
 def drawings_of(facts: Facts) -> list[CheckDrawing]:
@@ -171,7 +171,7 @@ def _drawn(facts: Facts, judged: dict[str, str]) -> Iterator[CheckDrawing]:
             yield CheckDrawing(note.step, summary, data_uri(note.value))
 
 
-def _figure(note: JournalEntry) -> Figure:
+def _figure(note: JournalEntry) -> FigureData:
     """Return a scatter plot of the series of points that a verify step logged."""
     value: dict[str, Any] = note.value
     series = value["series"].items()

@@ -15,7 +15,7 @@ from flangeye.types import Floats
 from flangeye.workflow.report.look import SERIES
 
 Trace = dict[str, Any]
-Figure = dict[str, Any]
+FigureData = dict[str, Any]
 
 DIVERGING = [
     [0.0, "#2166ac"],
@@ -84,7 +84,7 @@ def box_edges(centre: Floats, size: Floats) -> list[Floats]:
     return [np.asarray(centre) + np.stack(pair) * np.asarray(size) for pair in pairs]
 
 
-def figure3d(traces: list[Trace], eye: tuple[float, float, float] = (1.7, 0.92, 0.7)) -> Figure:
+def figure3d(traces: list[Trace], eye: tuple[float, float, float] = (1.7, 0.92, 0.7)) -> FigureData:
     """Return a 3D figure of traces from :func:`scatter3d`, in mm, with equal scales.
 
     The ranges are set here, so that the longest side always fills the same part of the view:

@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.maths.statistics import rms
 from flangeye.workflow.report.facts import Facts
 from flangeye.workflow.report.look import SERIES
-from flangeye.workflow.report.plot import Figure, Trace, plain
+from flangeye.workflow.report.plot import FigureData, Trace, plain
 from flangeye.workflow.report.units import millimetres
 from flangeye.workflow.result import contract as r
 
@@ -77,7 +77,7 @@ def errors_of(facts: Facts) -> Errors:
     return Errors(tuple(facts.measured), facts.residuals, held)
 
 
-def residual_figure(errors: Errors) -> Figure | None:
+def residual_figure(errors: Errors) -> FigureData | None:
     """Return the plot, or None when there are no errors to show."""
     if not errors.residuals and not errors.held_out:
         return None

@@ -13,7 +13,7 @@ from flangeye.types.geometry import arc_lengths
 from flangeye.workflow.report.facts import Facts
 from flangeye.workflow.report.look import SERIES
 from flangeye.workflow.report.plot import (
-    Figure,
+    FigureData,
     Trace,
     curve,
     figure3d,
@@ -50,11 +50,11 @@ class WeldDrawing:
 
     report: WeldReport
     summary: str
-    paths: Figure
-    offsets: Figure
-    deviation: Figure
-    contact: Figure
-    speeds: Figure
+    paths: FigureData
+    offsets: FigureData
+    deviation: FigureData
+    contact: FigureData
+    speeds: FigureData
     loop: tuple[tuple[str, str], ...]
 
 
@@ -100,7 +100,7 @@ def _measured(weld: WeldReport) -> tuple[tuple[str, Floats, str], ...]:
     )
 
 
-def _paths(weld: WeldReport, plane: WeldPlane) -> Figure:
+def _paths(weld: WeldReport, plane: WeldPlane) -> FigureData:
     x, y = plane.flat(weld.planned).T * 1e3
     traces = [curve(x, y, "planned", SERIES["held_out"], dash="dot")]
     for name, places, colour in _measured(weld):
@@ -111,7 +111,7 @@ def _paths(weld: WeldReport, plane: WeldPlane) -> Figure:
     return {"data": traces, "layout": layout}
 
 
-def _offsets(weld: WeldReport, plane: WeldPlane) -> Figure:
+def _offsets(weld: WeldReport, plane: WeldPlane) -> FigureData:
     traces = []
     for name, places, colour in _measured(weld):
         beside = plane.beside(weld.planned, places) if len(places) else np.zeros((2, 0))
@@ -121,7 +121,7 @@ def _offsets(weld: WeldReport, plane: WeldPlane) -> Figure:
     return {"data": traces, "layout": layout}
 
 
-def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> Figure:
+def _deviation(weld: WeldReport, plane: WeldPlane, truth: Floats | None) -> FigureData:
     """Return a plot of the estimated torch with its 95 % band, and the true one if known."""
     true_torch = weld.true_torch if len(weld.true_torch) else weld.torch
     traces = []
@@ -150,7 +150,7 @@ def _beside(
     return along[beside], across[beside], beside
 
 
-def _contact(weld: WeldReport) -> Figure:
+def _contact(weld: WeldReport) -> FigureData:
     traces = [
         curve(weld.time, weld.deflection * 1e3, "deflection", SERIES["used"]),
         curve(weld.time, weld.wanted * 1e3, "wanted", SERIES["circle"], dash="dot"),
@@ -161,7 +161,7 @@ def _contact(weld: WeldReport) -> Figure:
     return {"data": traces, "layout": layout}
 
 
-def _speeds(weld: WeldReport) -> Figure:
+def _speeds(weld: WeldReport) -> FigureData:
     traces = [
         curve(weld.time, weld.speed * 1e3, "robot [mm/s]", SERIES["used"]),
         curve(weld.time, np.degrees(weld.turn), "turning [deg/s]", SERIES["circle"]),

@@ -14,8 +14,8 @@ def _listed(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-Vector = Annotated[list[float], BeforeValidator(_listed)]
-Point = Annotated[Vector, Field(min_length=3, max_length=3)]
+NumberList = Annotated[list[float], BeforeValidator(_listed)]
+PointList = Annotated[NumberList, Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[list[float]], BeforeValidator(_listed)]
 
 
@@ -31,7 +31,7 @@ class TransformResult(_ResultPart):
     covariance: Matrix
     """6x6, order (rotation [rad], translation [m]), of a left perturbation in the parent frame, the
     translation taken at `about`."""
-    about: Point
+    about: PointList
     """Point in the parent frame [m]."""
     unobservable: Matrix | None = None
     """Directions (rotation, translation), about the same point, along which the estimate is
@@ -80,8 +80,8 @@ class ObservationResult(_ResultPart):
     """One capture and its outcome; measured values are null if it was rejected early."""
 
     id: str
-    centre_in_camera: Point | None = None
-    normal_in_camera: Point | None = None
+    centre_in_camera: PointList | None = None
+    normal_in_camera: PointList | None = None
     radii: dict[str, float] | None = None
     covariance: Matrix | None = None
     """3x3, of the centre [m^2]."""
@@ -89,14 +89,14 @@ class ObservationResult(_ResultPart):
     """Share of the rim that was seen."""
     clocking: float | None = None
     """Angle of the hole pattern [rad], if seen."""
-    tcp_in_base: Point | None = None
+    tcp_in_base: PointList | None = None
     camera: str | None = None
     """Which camera of a cell saw it."""
     target: str | None = None
     """Which target of a cell it saw."""
     residual: float | None = None
     """Distance of mapped centre and TCP [m]."""
-    residual_in_base: Point | None = None
+    residual_in_base: PointList | None = None
     """Mapped centre minus TCP [m]."""
     used: bool
     reason: str | None = None
@@ -143,8 +143,8 @@ class VerificationResult(_ResultPart):
 class WorkspaceResult(_ResultPart):
     """Where the work is."""
 
-    centre: Point
-    size: Point
+    centre: PointList
+    size: PointList
 
 
 class ExpectedErrorResult(_ResultPart):
@@ -210,7 +210,7 @@ class SeamResult(_ResultPart):
     """(N, 3) unit vectors towards the torch."""
     covariance: list[Matrix]
     """(N, 3, 3) of the points [m^2]."""
-    tube: Vector
+    tube: NumberList
     """(N,) radius about each point within which the seam is with 95 % probability [m]."""
     half_angle: float | None = None
     """Half angle of the groove [rad]."""
@@ -250,22 +250,22 @@ class WeldResult(_ResultPart):
 class FieldResult(_ResultPart):
     """A smooth displacement over the workspace; flangeye.maths.arm_correction evaluates it."""
 
-    about: Point
+    about: PointList
     """Middle of the calibration's poses, in the base [m]."""
     length: float
     """Correlation length of the field [m]."""
-    weights: Vector
+    weights: NumberList
     """Weights of the K features [m]."""
 
 
 class CorrectionResult(_ResultPart):
     """Estimated errors of the arm, with which its poses can be corrected."""
 
-    tool_offset: Point
+    tool_offset: PointList
     """The circle's centre in the flange frame [m]."""
-    joint_offsets: Vector | None = None
+    joint_offsets: NumberList | None = None
     """Offsets to add to the joint angles [rad]."""
-    joints: Vector | None = None
+    joints: NumberList | None = None
     """A configuration on the branch of the arm that was calibrated [rad]."""
     lengths: Matrix | None = None
     """nx3, to add to each joint's a, d [m] and alpha [rad]."""

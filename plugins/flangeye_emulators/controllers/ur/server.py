@@ -18,7 +18,7 @@ from flangeye_emulators.controllers.ur.script import run_program, take_program
 
 DASHBOARD_PORT = 29999
 
-Answer = Callable[[URController], str]
+Reply = Callable[[URController], str]
 
 
 class DashboardSession(LineConnection):
@@ -52,7 +52,7 @@ def answer(box: URController, text: str) -> str:
         return str(refused)
 
 
-def _doing(action: Callable[[URController], None], words: str) -> Answer:
+def _doing(action: Callable[[URController], None], words: str) -> Reply:
     def act(box: URController) -> str:
         action(box)
         return words
@@ -64,7 +64,7 @@ def _stop(box: URController) -> None:
     box.stop_program("stopped at the dashboard")
 
 
-DASHBOARD: dict[str, Answer] = {
+DASHBOARD: dict[str, Reply] = {
     "polyscopeversion": lambda box: f"URSoftware {'.'.join(map(str, box.box.version))} (loopback)",
     "get serial number": lambda box: "20245500001",
     "get robot model": lambda box: box.robot.model.rstrip("e").upper(),

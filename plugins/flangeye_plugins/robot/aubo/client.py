@@ -11,7 +11,7 @@ import numpy as np
 from flangeye.devices import SILENT, DeviceError
 from flangeye.types import Floats
 
-Answer = TypeVar("Answer")
+Returned = TypeVar("Returned")
 
 
 STANDSTILL = 2e-3
@@ -67,7 +67,7 @@ class AuboClient:
         self.motion: Any = robot.getMotionControl()
         self.config: Any = robot.getRobotConfig()
 
-    def ask(self, what: str, question: Callable[[], Answer]) -> Answer:
+    def ask(self, what: str, question: Callable[[], Returned]) -> Returned:
         """Call a query of the library and return its answer.
 
         Raises:

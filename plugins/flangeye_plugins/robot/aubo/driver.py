@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.devices import GRACE, Device, DeviceError, Mode, Robot, RobotState, load_sdk
+from flangeye.devices import GRACE, ArmMode, Device, DeviceError, Robot, RobotState, load_sdk
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
 from flangeye.types import BASE, FLANGE, TOOL, Floats, Transform
@@ -28,7 +28,7 @@ POSE = CONVENTIONS["rpy"]
 """The interface's poses: (x, y, z, rx, ry, rz) [m, rad], turned about fixed axes."""
 
 
-SAFETY: dict[str, tuple[Mode, str]] = {
+SAFETY: dict[str, tuple[ArmMode, str]] = {
     "Recovery": ("not ready", "the arm is outside its safety limits: move it back"),
     "Violation": ("not ready", "safety violation: look at the pendant"),
     "ProtectiveStop": (
@@ -284,7 +284,7 @@ class AuboRobot(Device):
         if message:
             raise DeviceError(f"{self.name}: {message}")
 
-    def _condition(self, speeds: Floats) -> tuple[Mode, str]:
+    def _condition(self, speeds: Floats) -> tuple[ArmMode, str]:
         """Return the mode, and a message with the remedy."""
         tell = self._client.state
         safety = self._ask("safety mode", tell.getSafetyModeType).name

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from flangeye.devices import SILENT, DeviceError, Mode, Robot
+from flangeye.devices import SILENT, ArmMode, DeviceError, Robot
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
 from flangeye.types import Floats, Transform
@@ -160,7 +160,7 @@ class Ros2Arm(Listener):
         finally:
             super().close()
 
-    def _mode(self, moves: bool) -> Mode:
+    def _mode(self, moves: bool) -> ArmMode:
         # How long a controller may take to its goal when the motion is over [s]
         settles = time.monotonic() < self._ended + 0.3
         return "moving" if moves or settles or self._motion is not None else "ready"
@@ -269,7 +269,7 @@ class FreedriveArm(Listener):
     def _facing(self) -> Floats:
         return self.arm.flange(self._fresh().joints)[:3, 2]
 
-    def _mode(self, moves: bool) -> Mode:
+    def _mode(self, moves: bool) -> ArmMode:
         now, joints = time.monotonic(), self._samples[-1].joints
         if moves:
             self._stood_since = now

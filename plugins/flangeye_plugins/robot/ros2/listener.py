@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from flangeye.devices import Device, DeviceError, Mode, RobotState
+from flangeye.devices import ArmMode, Device, DeviceError, RobotState
 from flangeye.errors import StageError
 from flangeye.files.processes import busy
 from flangeye.maths.kinematics import Arm
@@ -137,7 +137,7 @@ class Listener(Device):
             return self._frames.pose(tf.base, tf.flange)
         return self.arm.flange(sample.joints)
 
-    def _mode(self, moves: bool) -> Mode:
+    def _mode(self, moves: bool) -> ArmMode:
         return "moving" if moves else "ready"
 
     def _measured_period(self) -> float:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from flangeye.devices import Device, DeviceError, Mode, Robot, RobotState, load_sdk
+from flangeye.devices import ArmMode, Device, DeviceError, Robot, RobotState, load_sdk
 from flangeye.files.processes import busy
 from flangeye.models.robots import RobotModel
 from flangeye.plugin.stage import part
@@ -35,7 +35,7 @@ REMOTE = "it is in local control: choose Remote Control at the top right of the 
 
 POWER = "the arm has no power or its brakes are on: switch it on at the pendant"
 
-SAFETY: Mapping[tuple[int, str], tuple[Mode, str]] = {
+SAFETY: Mapping[tuple[int, str], tuple[ArmMode, str]] = {
     (3, "PROTECTIVE_STOP"): (
         "protective stop", "protective stop: find the cause, then release it at the pendant"
     ),
@@ -56,7 +56,7 @@ SAFETY: Mapping[tuple[int, str], tuple[Mode, str]] = {
 its text."""
 
 
-def safety_of(told: int | str) -> tuple[Mode, str] | None:
+def safety_of(told: int | str) -> tuple[ArmMode, str] | None:
     """Return mode and message for a safety mode (number or word); None if it is unknown."""
     return next((meaning for names, meaning in SAFETY.items() if told in names), None)
 
@@ -145,7 +145,7 @@ class Condition(NamedTuple):
         message: Remedy for a fault; empty without one.
     """
 
-    mode: Mode
+    mode: ArmMode
     message: str = ""
 
 
@@ -158,7 +158,7 @@ def condition_of(sample: CycleSample, commanded: bool) -> Condition:
     """
     # NORMAL and REDUCED (RTDE guide)
     if sample.safety_mode not in (1, 2):
-        unknown: tuple[Mode, str] = ("not ready", f"safety mode {sample.safety_mode}")
+        unknown: tuple[ArmMode, str] = ("not ready", f"safety mode {sample.safety_mode}")
         return Condition(*safety_of(sample.safety_mode) or unknown)
     if sample.robot_mode != 7:  # RUNNING
         return Condition("not ready", POWER)

@@ -27,7 +27,7 @@ try:
 except ImportError:  # Humble
     from rclpy.qos_event import SubscriptionEventCallbacks
 
-Request = dict[str, Any]
+BridgeRequest = dict[str, Any]
 
 
 class RequestRefused(Exception):
@@ -42,7 +42,7 @@ class FramedOutput:
         self._stream = os.fdopen(os.dup(1), "wb")
         os.dup2(2, 1)
 
-    def say(self, header: Request, body: bytes = b"") -> None:
+    def say(self, header: BridgeRequest, body: bytes = b"") -> None:
         """Write a frame; exit the process if the reader has gone."""
         line = json.dumps({**header, "size": len(body)}).encode() + b"\n"
         try:
@@ -226,7 +226,7 @@ def serve(bridge: BridgeNode, output: FramedOutput) -> None:
     rclpy.try_shutdown()
 
 
-def answer(bridge: BridgeNode, request: Request) -> Request:
+def answer(bridge: BridgeNode, request: BridgeRequest) -> BridgeRequest:
     """Execute a request and return its answer."""
     try:
         given = getattr(bridge, request.pop("ask"))(**request)

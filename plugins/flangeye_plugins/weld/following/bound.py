@@ -42,10 +42,10 @@ REMEDIES = {
 """For each part of the variance: what it consists of, and how to reduce it."""
 
 
-Number = TypeVar("Number", float, Floats)
+Scalar = TypeVar("Scalar", float, Floats)
 
 
-class Stance(NamedTuple, Generic[Number]):
+class Stance(NamedTuple, Generic[Scalar]):
     """Orientation of the tool relative to the seam, with the torch at one place or at several.
 
     Attributes:
@@ -54,9 +54,9 @@ class Stance(NamedTuple, Generic[Number]):
         minutes: Time since the sweep [min].
     """
 
-    sine: Number
-    turned: Number
-    minutes: Number
+    sine: Scalar
+    turned: Scalar
+    minutes: Scalar
 
 
 class Predicted(NamedTuple):
@@ -88,8 +88,8 @@ class Predicted(NamedTuple):
 
 
 def varying(
-    prior: ModelPrior, settings: Following, learned: SweepFit, press: float, stance: Stance[Number]
-) -> tuple[Number, Number, Number]:
+    prior: ModelPrior, settings: Following, learned: SweepFit, press: float, stance: Stance[Scalar]
+) -> tuple[Scalar, Scalar, Scalar]:
     """Return the variances that vary along the seam: askew, tip and felt of :class:`Predicted`.
 
     Args:

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import State
+from flangeye.estimation.watch.drift import DriftState
 from flangeye.files.regular import read_regular, write_whole
 from flangeye.workflow.log.read import decode_json
 from flangeye.workflow.log.record import adapter
@@ -61,7 +61,7 @@ class CheckFinding:
     """
 
     check: int
-    state: State
+    state: DriftState
     shift: Finite
     motion: Annotated[tuple[Finite, ...], Field(min_length=6, max_length=6)]
     since: Annotated[int, Field(ge=0)] | None

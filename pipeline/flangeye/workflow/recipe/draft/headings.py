@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from flangeye.files.scans import CLOUD_SUFFIXES, IMAGES
-from flangeye.files.tables import Cell, Column, Table, entry_of_list, number_of
+from flangeye.files.tables import CellValue, Column, Table, entry_of_list, number_of
 from flangeye.models.robots import joints_in_order
 from flangeye.types.pose_formats import ANGLES, CONVENTIONS, LENGTHS
 
@@ -272,7 +272,7 @@ def _is_index(table: Table, index: int, words: Sequence[str]) -> bool:
     return (words[-1].lower() in called if words else index == 0) and table.numbers_rows(index)
 
 
-def _first(table: Table, index: int) -> Cell:
+def _first(table: Table, index: int) -> CellValue:
     """Return the first cell of a column that is not empty: a target may not be seen at first."""
     cells = (cells[index] for _, cells in table.rows if index < len(cells))
     return next((cell for cell in cells if cell not in ("", " ")), "")

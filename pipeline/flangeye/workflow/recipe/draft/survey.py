@@ -21,11 +21,11 @@ from flangeye.workflow.recipe.draft.headings import lists_in, role_in
 
 Prompt = Callable[[str, str | None], str]
 """Asks a person; takes the question and the default, returns the answer."""
-Check = Callable[[str], object]
+AnswerCheck = Callable[[str], object]
 """Raises :class:`FlangeyeError` for an answer that cannot be used."""
 
 
-def one_of(*choices: str) -> Check:
+def one_of(*choices: str) -> AnswerCheck:
     """Return a check that only ``choices`` pass."""
 
     def check(answer: str) -> None:
@@ -63,7 +63,7 @@ class Questions:
         question: str,
         default: str | None,
         example: str = "",
-        check: Check | None = None,
+        check: AnswerCheck | None = None,
         known: str = "",
     ) -> str:
         """Return the answer to a question; a person is asked again after an invalid answer.
@@ -94,7 +94,7 @@ class Questions:
         return answer
 
     def _asked(
-        self, flag: str, question: str, default: str | None, example: str, check: Check | None
+        self, flag: str, question: str, default: str | None, example: str, check: AnswerCheck | None
     ) -> str:
         if self.prompt is None:
             self.open = flag
