@@ -121,9 +121,7 @@ def _draw(path: Sequence[tables.SessionRow]) -> Any:
             panel.plot(steps, values, ".-", color=colour, label=label)
         panel.axvline(5, color="#94a3b8", linewidth=1, linestyle=":")
         value = tables.TABLE_1["Aubo i5 PhoXi S"]["xyz".index(axis)]
-        panel.plot(
-            [5], [value], "D", color=tables.PRINTED.colour, label="Table 1, where theirs stopped"
-        )
+        panel.plot([5], [value], "D", color=tables.PRINTED.colour, label="Table 1, after 5 steps")
         panel.set_xscale("log")
         tables.dress(panel, f"{axis} of the Aubo's verification", "steps of ICP", f"{axis} [mm]")
     page.panels[0].set_ylim(bottom=-0.95)  # room for the key below the lines

@@ -61,7 +61,11 @@ def test_a_name_in_common_comes_before_a_number() -> None:
         ("p1 p2 p3", "i0 i1 i2", "no partner for p3, and no partner for i0; rename or remove them"),
         ("p1 p2 p3", "i1 i3", "no partner for p2; rename or remove them"),
         ("p1 p01", "i1 i2", "no partner for i2; rename or remove them"),
-        ("p1 p01", "i1 i01", "share a number more than once; give each pair one name or number"),
+        (
+            "p1 p01",
+            "i1 i01",
+            "some have the same number; give each pair a name or number of its own",
+        ),
         ("a b", "c d", "no partner for a, b, and no partner for c, d; rename or remove them"),
     ],
 )

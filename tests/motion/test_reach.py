@@ -193,7 +193,7 @@ def test_an_arm_under_way_does_not_fold_over(turn: float, folds: bool) -> None:
     assert arm.joints(ARM.flange(SHOWN)) is not None  # nothing is known of where it stands
     arm.start_from(start)
     assert (arm.joints(ARM.flange(SHOWN)) is None) is folds
-    assert arm.why_refused() == ("1 only with the arm folded over" if folds else "")
+    assert arm.why_refused() == ("1 only with a joint more than 120 deg from home" if folds else "")
 
 
 def scaled(joints: Any) -> float:

@@ -277,7 +277,7 @@ def test_poses_that_cannot_be_reached_are_red(browser: Any, served: Served) -> N
     _, _, sizes, centres = cv2.connectedComponentsWithStats(new)
     x, y = centres[1 + int(np.argmax(sizes[1:, cv2.CC_STAT_AREA]))]
     page.locator(".scene").hover(position={"x": x, "y": y})
-    page.locator(".scene").get_by_text("only with the arm folded over").wait_for()
+    page.locator(".scene").get_by_text("only with a joint more than 120 deg from home").wait_for()
     shot(page, "poses_barred")
 
 

@@ -104,7 +104,7 @@ def _differing(
     (poses, lone), (others, other_lone) = ours, theirs
     count = f"{len(poses)} poses ({poses[0]}, …) and {len(others)} {what} ({others[0]}, …)"
     if not lone and not other_lone:
-        return f"{count} share a number more than once; give each pair one name or number"
+        return f"{count}: some have the same number; give each pair a name or number of its own"
     sides = [f"no partner for {_list(names)}" for names in (lone, other_lone) if names]
     return f"{count} differ in their numbers: {', and '.join(sides)}; rename or remove them"
 

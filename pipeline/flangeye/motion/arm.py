@@ -150,7 +150,7 @@ class WatchedArm:
                 raise DeviceError(f"the arm {complaint} ({patience:.0f} s){busy()}")
             report: Report = self._wire.recv()
         except (EOFError, OSError):
-            raise DeviceError("the arm is lost: its guard has ended") from None
+            raise DeviceError("the arm is lost: the process that supervises it has ended") from None
         return report
 
 

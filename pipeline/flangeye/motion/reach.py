@@ -190,7 +190,7 @@ class Reach:
         # An arm that is under way does not turn a joint farther from home: it would fold over
         fold = np.radians(120.0)
         if self._start is not None and _turn(nearest, self.home) > fold:
-            self._refuse(base_T_flange, "only with the arm folded over")
+            self._refuse(base_T_flange, "only with a joint more than 120 deg from home")
             return None
         return nearest
 

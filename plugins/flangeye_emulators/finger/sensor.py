@@ -23,7 +23,7 @@ from flangeye_emulators.weld_world.world import ImageQueue, Nominal, WeldWorld
 from flangeye_emulators.world import bench
 from flangeye_emulators.world.bench import LaidParams
 from flangeye_plugins.weld.corners import corners_of
-from flangeye_plugins.weld.frame import Tool, WorkSurface, unrolled
+from flangeye_plugins.weld.frame import Tool, WorkSurface, flattened
 from flangeye_plugins.weld.touch.tag_observation import dictionary_of
 
 
@@ -70,7 +70,7 @@ class SimulatedFinger(Device):
         self.camera_matrix, self.distortion = finger.camera.matrix, np.array([])
         self._surface, nominal = _as_planned(finger, params)
         self._planned = self._surface.path
-        self.world = WeldWorld(nominal, truth, [seed, 12], self._unrolled)
+        self.world = WeldWorld(nominal, truth, [seed, 12], self._flattened)
         self.tool = Tool(finger, self._surface)
         self._robot, self._params = robot, params
         self._rng = np.random.default_rng([seed, 11])
@@ -117,7 +117,7 @@ class SimulatedFinger(Device):
         known = list(self._torch)  # in one go: a thread that reads images may add to it
         times, near = (np.array([each[i] for each in known]) for i in (0, 2))
         torch = np.array([place for _, place, _ in known]).reshape(-1, 3)
-        return times, self._surface.unrolled(torch, near)
+        return times, self._surface.to_base(torch, near)
 
     def _beside_plan(self) -> tuple[Floats, float]:
         """Return the torch (3,) relative to the planned seam [m], and its arc length there [m].
@@ -149,16 +149,16 @@ class SimulatedFinger(Device):
         axes = self.tool.in_plane(base_T_flange)
         return np.asarray(rotation_from_rpy(0.0, 0.0, -pose.angle) @ axes)
 
-    def _unrolled(self, tip: Floats, torch: Floats) -> Floats:
-        """Return the torch (3,) in the rolled-out plane, from the tangent plane at the tip."""
+    def _flattened(self, tip: Floats, torch: Floats) -> Floats:
+        """Return the torch (3,) in the flattened plane, from the tangent plane at the tip."""
         surface = self._surface
         before = self.world.contact.s
-        in_base = surface.unrolled(tip[None], np.array([before]))[0]
+        in_base = surface.to_base(tip[None], np.array([before]))[0]
         s = surface.foot(in_base, before)
         beside = surface.at(s)
         near = s + float((torch - tip)[:2] @ beside.place.tangent)
-        in_base = in_base + beside.unrolled(torch - tip)
-        return surface.rolled(in_base, surface.foot(in_base, near))
+        in_base = in_base + beside.to_base(torch - tip)
+        return surface.to_plane(in_base, surface.foot(in_base, near))
 
     def _image(self, displacement: Floats) -> Image:
         return self._camera.image(*self._compliance.tag(displacement))
@@ -175,7 +175,7 @@ def _as_planned(finger: ToolFile, params: SimulatedFingerParams) -> tuple[WorkSu
     points = seam.points @ pose[:3, :3].T + pose[:3, 3]
     openings = seam.openings @ pose[:3, :3].T
     if params.leg is not None:
-        corners = [corner.point for corner in corners_of(unrolled(points, openings))]
+        corners = [corner.point for corner in corners_of(flattened(points, openings))]
         bounds = [0, *corners, len(points) - 1]
         kept = slice(bounds[params.leg - 1], bounds[params.leg] + 1)
         points, openings = points[kept], openings[kept]

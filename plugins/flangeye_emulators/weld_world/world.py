@@ -69,7 +69,7 @@ class WeldWorld:
         nominal: Nominal,
         truth: WeldTruth,
         seed: int | list[int],
-        unrolled: Callable[[Floats, Floats], Floats] = lambda tip, torch: torch,
+        flattened: Callable[[Floats, Floats], Floats] = lambda tip, torch: torch,
     ) -> None:
         """Construct a world from nominal and true values.
 
@@ -77,8 +77,8 @@ class WeldWorld:
             nominal: Values that the files state.
             truth: True values of the world.
             seed: Seed of its random values.
-            unrolled: Maps tip (3,) and torch (3,), both in the tangent plane at the tip, to the
-                torch (3,) in the rolled-out plane; the default is a flat surface.
+            flattened: Maps tip (3,) and torch (3,), both in the tangent plane at the tip, to the
+                torch (3,) in the flattened plane; the default is a flat surface.
         """
         rng = np.random.default_rng(seed)
         self.groove: Groove = true_groove(nominal.seam, nominal.section, truth.workpiece, rng)
@@ -89,7 +89,7 @@ class WeldWorld:
         self._tool, self._stands = TrueTool(truth.tool, nominal.torch), nominal.level_R_tool
         self._finger = TrueFinger(truth.finger)
         self._heat = SeamDistortion(truth.heat, self.groove.root.length)
-        self._unrolled = unrolled
+        self._flattened = flattened
         self.tip, self.torch = np.zeros(3), np.zeros(3)
         self._behind = float(nominal.torch[0])
         self.torch_s, self.off = self._behind, 0.0
@@ -107,7 +107,7 @@ class WeldWorld:
         """
         stands = self._stands if level_R_tool is None else level_R_tool
         pose = self._arm.true_pose(reported)
-        self.torch = self._unrolled(pose.position, self._tool.torch(pose, stands))
+        self.torch = self._flattened(pose.position, self._tool.torch(pose, stands))
         root = self.groove.root
         # The plane of a round seam may lie on itself: the torch is where it follows the tip.
         behind = self.contact.s + self._behind

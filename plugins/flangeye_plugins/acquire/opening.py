@@ -256,8 +256,8 @@ def _require_kinds(root: Path, recordings: Sequence[Recording], cell: Cell) -> N
         for name in recording.axes:
             if not isinstance(cell.movers[name], Axis):
                 raise StageError(
-                    f"{root}: '{name}' is an arm, and has one value a pose; give its poses in the "
-                    "reader's arms"
+                    f"{root}: '{name}' is an arm, but its table has one value a row, as an axis "
+                    "has; give its poses under the reader's arms"
                 )
         for name, pose in recording.poses.items():
             distance = float(np.linalg.norm(pose[:3, 3]))

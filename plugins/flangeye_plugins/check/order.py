@@ -218,8 +218,8 @@ def identity(session: RecordedSession) -> Findings:
         robot = np.abs(poses - np.eye(4)).max(axis=(1, 2), initial=0.0) < NOT_MEASURED_TWICE
         if robot.any():
             what = (
-                f"{robot.sum()} of {len(session)} {whose} poses are the identity: the flange "
-                "cannot be in the base; the driver had no pose to give"
+                f"{robot.sum()} of {len(session)} {whose} poses are the identity, which "
+                "puts the flange at the base's origin: the driver had no pose to give"
             )
             yield _left_out(session, robot, "identity matrices", what)
     marker = _is_identity(session)

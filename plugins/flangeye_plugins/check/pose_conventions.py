@@ -41,7 +41,8 @@ from flangeye_plugins.check.fitting import (
 _FLIPPED: Mapping[str, tuple[PoseChange, str]] = {
     "inverted": (
         inverted,
-        "poses are flange_T_base (or the camera is carried the other way round)",
+        "poses are flange_T_base (or the camera is on the flange where the recipe has it beside "
+        "the arm, or the reverse)",
     ),
     "transposed": (
         transposed,

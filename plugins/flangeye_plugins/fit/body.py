@@ -195,8 +195,8 @@ def _unlike(
         return Rejected(
             f"the scan shows {name} in another size than its mesh has: the mesh's scale is wrong, "
             "or another object was found",
-            f"{'larger' if larger > 0 else 'smaller'} by {abs(larger):.1%} at least, known to "
-            f"{unsure:.1%}",
+            f"{'larger' if larger > 0 else 'smaller'} by at least {abs(larger):.1%}, standard "
+            f"deviation {unsure:.1%}",
         )
     return None
 

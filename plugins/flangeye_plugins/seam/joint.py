@@ -403,8 +403,8 @@ def _refuse_plane(found: FoundJoint) -> None:
     filled = min(float(within.sum() * pitch**2 / max(gap * length, 1e-12)), 1.0)
     if gap < 2 * pitch or filled > 1 / 3:
         raise CalibrationRefused(
-            f"{STAGE}: no gap is seen: {gap * 1e3:.2f} mm, {filled:.0%} of it filled, with points "
-            f"{pitch * 1e3:.2f} mm apart",
+            f"{STAGE}: no gap is seen: {gap * 1e3:.2f} mm fits best, but {filled:.0%} of its area "
+            f"has points on it, which are {pitch * 1e3:.2f} mm apart",
             "scan nearer, or name another joint",
         )
 

@@ -305,7 +305,7 @@ def _why_none(every: list[FoundPose], body: TargetBody) -> Rejected:
     return Rejected(
         f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: is it in "
         "view, and are the mesh's unit and handedness right?",
-        f"best candidate: {best.shown:.0%} of the rays that should hit it do ({best.agree}), "
+        f"best candidate: {best.shown:.0%} of the rays that should hit it do ({best.agree} rays), "
         f"{best.trusted:.1%} of the rays at and beside it agree, standard deviation of its pose "
         f"{every[0].weakest * body.size * 1e3:.1f} mm",
     )

@@ -126,7 +126,7 @@ def check_weave(distance: float, settings: Following) -> None:
         raise StageError(
             f"weld.tactile: a weave of {weave.width * 1e3:.3g} mm at "
             f"{weave.frequency:.3g} Hz turns the tool at {np.degrees(asked):.0f} deg/s, "
-            f"{Steering.usual:.0%} of turn_rate are {np.degrees(allowed):.0f} deg/s; lower "
+            f"limit {np.degrees(allowed):.0f} deg/s ({Steering.usual:.0%} of turn_rate); lower "
             f"'weave_frequency' to {weave.frequency * allowed / asked:.2f}, or raise "
             "'turn_rate'"
         )

@@ -20,7 +20,7 @@ import numpy as np
 from flangeye.errors import StageError
 from flangeye.types import Floats, Seam
 from flangeye.types.geometry import arc_lengths, rows_at
-from flangeye_plugins.weld.frame import unrolled
+from flangeye_plugins.weld.frame import flattened
 from flangeye_plugins.weld.path import CHORD
 from flangeye_plugins.weld.settings import WeldTactileParams
 
@@ -71,7 +71,7 @@ def leg_of(seam: Seam, params: WeldTactileParams) -> Seam:
         StageError: The plan has corners but neither leg nor radius is set, or both are, or the leg
             does not exist, or there is no room for the tool at a corner or for the arc.
     """
-    corners = corners_of(unrolled(seam.points_in_base, seam.openings_in_base))
+    corners = corners_of(flattened(seam.points_in_base, seam.openings_in_base))
     if params.corner_radius is not None:
         return _rounded(seam, corners, params, params.corner_radius)
     if params.leg is None:

@@ -1,7 +1,7 @@
 """The work surface along a seam, and the tool's orientation on it.
 
 A seam may climb, bend and twist. The controller works in a plane into which the work surface is
-rolled out: arc length and geodesic curvature of the seam are kept, and its openings all point
+flattened: arc length and geodesic curvature of the seam are kept, and its openings all point
 upwards. Positions beside the seam agree to first order in their distance from it.
 """
 
@@ -74,21 +74,21 @@ class SeamPlace(NamedTuple):
     axes: Floats
     place: PathPlace
 
-    def rolled(self, vectors: Floats) -> Floats:
-        """Convert a vector (3,) in base to the axes of the rolled-out plane."""
+    def to_plane(self, vectors: Floats) -> Floats:
+        """Convert a vector (3,) in base to the axes of the flattened plane."""
         along, left, up = (vectors @ self.axes).tolist()
         tx, ty = self.place.tangent.tolist()
         return np.array([along * tx - left * ty, along * ty + left * tx, up])
 
-    def unrolled(self, vector: Floats) -> Floats:
-        """Convert a vector (3,) in the axes of the rolled-out plane to base."""
+    def to_base(self, vector: Floats) -> Floats:
+        """Convert a vector (3,) in the axes of the flattened plane to base."""
         x, y, z = vector.tolist()
         tx, ty = self.place.tangent.tolist()
         return np.asarray(self.axes @ np.array([x * tx + y * ty, y * tx - x * ty, z]))
 
 
 class WorkSurface:
-    """The surface along a seam, and the plane into which it is rolled out.
+    """The surface along a seam, and the plane into which it is flattened.
 
     The plane's x points along the seam as a whole, its z out of the work. A closed seam is
     continued by one more turn beyond both ends.
@@ -102,7 +102,7 @@ class WorkSurface:
     def __init__(self, points: Floats, openings: Floats) -> None:
         """Construct the surface from a seam's points (N, 3) [m] and openings (N, 3) in base."""
         points, openings, wraps = _gone_around(points, openings)
-        self.points = unrolled(points, openings)
+        self.points = flattened(points, openings)
         self.path = Path(self.points, wraps)
         along = arc_lengths(self.points)
         ticks = self.path.step * np.arange(len(self.path.points), dtype=np.float64)
@@ -183,10 +183,10 @@ class WorkSurface:
                 break
         return near
 
-    def rolled(self, point: Floats, s: float) -> Floats:
+    def to_plane(self, point: Floats, s: float) -> Floats:
         """Convert a point (3,) in base, near an arc length, to the plane (3,)."""
         stand = self.at(s)
-        off = stand.rolled(point - stand.point)
+        off = stand.to_plane(point - stand.point)
         off[:2] += stand.place.point
         return off
 
@@ -203,21 +203,21 @@ class WorkSurface:
         whole = self._rows[:, 6:].mean(axis=0)
         return max(float(off @ stand.axes[:, 2]), float(off @ whole / math.sqrt(whole @ whole)))
 
-    def unrolled(self, points: Floats, near: Floats) -> Floats:
+    def to_base(self, points: Floats, near: Floats) -> Floats:
         """Convert points (K, 3) in the plane to base.
 
         Args:
             points: Points in the plane [m]; on a closed seam the plane may overlap itself.
             near: (K,) approximate arc lengths of the points [m].
         """
-        each = [self._unrolled(*place) for place in zip(points, near.tolist(), strict=True)]
+        each = [self._point_to_base(*place) for place in zip(points, near.tolist(), strict=True)]
         return np.array(each).reshape(-1, 3)
 
-    def _unrolled(self, point: Floats, s: float) -> Floats:
+    def _point_to_base(self, point: Floats, s: float) -> Floats:
         for _ in range(2):
             s = self.path.foot(point[:2], s)
         stand = self.at(s)
-        return stand.point + stand.unrolled(point - [*stand.place.point, 0.0])
+        return stand.point + stand.to_base(point - [*stand.place.point, 0.0])
 
     def bending(self, distance: float) -> float:
         """Return the largest angle between the tool and the openings at its tip and torch [rad].
@@ -266,7 +266,7 @@ def _gone_around(points: Floats, openings: Floats) -> tuple[Floats, Floats, floa
     return rows[:, :3], rows[:, 3:], turn
 
 
-def unrolled(points: Floats, openings: Floats) -> Floats:
+def flattened(points: Floats, openings: Floats) -> Floats:
     """Return a seam's points in the plane (N, 3), with the distances and turns of the surface."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -315,9 +315,9 @@ class Tool:
         rotation, surface = base_T_flange.rotation, self._surface
         tip = rotation @ self._tip + base_T_flange.translation
         self._s = surface.foot(tip, self._s)
-        position = surface.rolled(tip, self._s)
+        position = surface.to_plane(tip, self._s)
         torch = rotation @ self._torch + base_T_flange.translation
-        behind = surface.rolled(torch, surface.foot(torch, self._s - self._distance))
+        behind = surface.to_plane(torch, surface.foot(torch, self._s - self._distance))
         ahead_x, ahead_y, _ = (position - behind).tolist()
         angle = math.atan2(ahead_y, ahead_x)
         if self._angle is not None:
@@ -354,7 +354,7 @@ class Tool:
         stand = surface.at(s)
         # Velocities in the plane are velocities on the surface: rolling out keeps lengths along the
         # seam.
-        velocity = stand.unrolled(command.velocity)
+        velocity = stand.to_base(command.velocity)
         up, tilt = self._standing(s)
         going = float(velocity @ stand.axes[:, 0])
         # Sum of the commanded turn about the surface's normal, a correction of the tool's tilt with
@@ -372,11 +372,11 @@ class Tool:
             near: Approximate arc length of the tip [m].
         """
         surface = self._surface
-        tip = surface.unrolled(position[None], np.array([near]))[0]
+        tip = surface.to_base(position[None], np.array([near]))[0]
         s = surface.foot(tip, near)
         stand, (up, _) = surface.at(s), self._standing(s)
         c, sine = math.cos(angle), math.sin(angle)
-        x = stand.unrolled(np.array([c, sine, 0.0]))
+        x = stand.to_base(np.array([c, sine, 0.0]))
         # The tool's x in the surface, made square to its own upward axis
         x = x - (x @ up) * up
         x /= np.linalg.norm(x)
@@ -389,7 +389,9 @@ class Tool:
         rotation = base_T_flange.rotation
         tip = rotation @ self._tip + base_T_flange.translation
         stand = self._surface.at(self._surface.foot(tip, self._s))
-        return np.stack([stand.rolled(axis) for axis in (rotation @ self._flange_R_tool).T], axis=1)
+        return np.stack(
+            [stand.to_plane(axis) for axis in (rotation @ self._flange_R_tool).T], axis=1
+        )
 
     def _standing(self, s: float) -> tuple[Floats, Floats]:
         """Return the tool's nominal upward axis (3,) at an arc length, and its derivative [1/m]."""

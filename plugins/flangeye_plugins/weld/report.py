@@ -29,7 +29,7 @@ def report_of(  # noqa: PLR0913  all that a weld had
     truth: tuple[Floats, Floats] | None = None,
 ) -> WeldReport:
     """Return the report of a weld; ``truth`` is a simulation's true torch: times, positions."""
-    plan, to_base = surface.path, surface.unrolled
+    plan, to_base = surface.path, surface.to_base
     reason = reason and f"{reason}; {_extent(controller, plan)}"
     every = columns(weld_log.cycles)
     kept = np.unique(np.linspace(0, len(weld_log.cycles) - 1, SAMPLES).round().astype(int))

@@ -167,8 +167,8 @@ def _of_one_camera(data: Any) -> None:
          "table to the reader"),
         (_timed, "{}/arm.csv: has times, and first_marker.csv has none; join all tables by time, "
          "or all by number"),
-        (_as_axis, "{}: 'arm' is an arm, and has one value a pose; give its poses in the reader's "
-         "arms"),
+        (_as_axis, "{}: 'arm' is an arm, but its table has one value a row, as an axis has; give "
+         "its poses under the reader's arms"),
         (_on_a_link, "{}: where link 3 of 'arm' is computed from its joint angles, which are "
          "missing: give their columns in the reader, arms: {{arm: {{joints: …}}}}"),
         (_five_joints, "{}: 'arm' has 5 joint angles, and a ur5 has 6 joints"),

@@ -112,7 +112,8 @@ def test_a_torch_is_within_its_height_of_the_seam(up: float, says: str | None) -
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_weave_turns_the_tool_with_four_fifths_of_the_turn_rate_at_most(share: float) -> None:
     width = share * 0.8 * ASKED.turn_rate * 0.04 / np.pi  # at 1 Hz
-    says = "16 deg/s; lower 'weave_frequency' to 0.99, or raise 'turn_rate'" if share > 1 else None
+    lower = "limit 16 deg/s (80% of turn_rate); lower 'weave_frequency' to 0.99"
+    says = f"{lower}, or raise 'turn_rate'" if share > 1 else None
     assert holds(check_weave, 0.04, following(weave_width=f"{width} m"), says=says)
 
 

@@ -24,16 +24,16 @@ TOLD = Finger.model_validate(
 )
 
 
-def test_a_flat_surface_is_rolled_out_along_the_seam_and_out_of_the_work() -> None:
+def test_a_flat_surface_is_flattened_along_the_seam_and_out_of_the_work() -> None:
     in_base = SEAM @ TURN.T + MIDDLE
     assert SURFACE.points == pytest.approx(SEAM, abs=1e-12)
     beside = np.array([[-0.07, 0.01, 0.02], [0.02, -0.03, 0.0], [0.09, 0.02, -0.01]])
-    there = SURFACE.unrolled(beside, np.array([0.0, 0.05, 0.1]))
+    there = SURFACE.to_base(beside, np.array([0.0, 0.05, 0.1]))
     assert there == pytest.approx(beside @ TURN.T + MIDDLE, abs=1e-12)
     for point, place in zip(there, beside, strict=True):
         s = SURFACE.foot(point)
         assert s == pytest.approx(place[0] + 0.05, abs=1e-12)
-        assert SURFACE.rolled(point, s) == pytest.approx(place, abs=1e-12)
+        assert SURFACE.to_plane(point, s) == pytest.approx(place, abs=1e-12)
     assert SURFACE.line(np.array([0.03]))[0][0] == pytest.approx(in_base[3], abs=1e-12)
     # An opening that leans along the seam has no other side.
     uneven = WorkSurface(SEAM, np.tile([0.1, 0.0, 1.0], (11, 1)))

@@ -1,4 +1,4 @@
-"""A seam that climbs, bends and twists, rolled out flat; and a weld along one, in three dimensions."""
+"""A seam that climbs, bends and twists, flattened; and a weld along one, in three dimensions."""
 
 from __future__ import annotations
 
@@ -68,17 +68,17 @@ SEAMS = (pipe_on_plate, pipe_on_pipe, over_a_hill)
 
 
 @pytest.mark.parametrize("seam", SEAMS)
-def test_what_is_rolled_out_is_as_long_and_comes_back_to_where_it_was(seam: Any) -> None:
+def test_what_is_flattened_is_as_long_and_comes_back_to_where_it_was(seam: Any) -> None:
     points, openings = seam()
     surface = WorkSurface(points, openings)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert np.linalg.norm(np.diff(surface.points, axis=0), axis=1) == pytest.approx(lengths)
     assert surface.path.length == pytest.approx(lengths.sum())
     along = np.concatenate([[0.0], np.cumsum(lengths)])
-    assert surface.unrolled(surface.points, along) == pytest.approx(points, abs=0.02e-3)
+    assert surface.to_base(surface.points, along) == pytest.approx(points, abs=0.02e-3)
     beside = surface.points[::20] + [0.0, 0.0, 1.5e-3]
-    for place, point in zip(beside, surface.unrolled(beside, along[::20]), strict=True):
-        assert surface.rolled(point, surface.foot(point)) == pytest.approx(place, abs=1e-6)
+    for place, point in zip(beside, surface.to_base(beside, along[::20]), strict=True):
+        assert surface.to_plane(point, surface.foot(point)) == pytest.approx(place, abs=1e-6)
 
 
 def test_a_circle_turns_in_the_surface_by_its_part_of_the_curvature() -> None:
@@ -100,7 +100,7 @@ def test_the_tool_stands_on_the_surface_with_tip_and_torch_on_the_seam(seam: Any
         for _ in range(5):
             flange = tool.base_T_flange(np.array([*place.point, 0.0]), angle, s)
             torch = flange.apply(np.array(TOLD.tip) + TOLD.flange_R_tool @ TOLD.torch_from_tip)
-            off = surface.rolled(torch, surface.foot(torch))
+            off = surface.to_plane(torch, surface.foot(torch))
             behind = path.at(surface.foot(torch))
             angle += float((off[:2] - behind.point) @ behind.normal) / body.distance
         assert np.linalg.norm(points - torch, axis=1).min() < 0.5e-3
@@ -198,6 +198,6 @@ def test_the_torch_keeps_to_a_seam_that_bends_out_of_every_plane(
     assert np.sqrt(np.mean(off**2)) < 0.25e-3 and np.abs(off).max() < 0.5e-3
     height = np.sum((seen - line[near]) * up[near], axis=1)[on]
     assert np.abs(height).max() < 2.5e-3
-    # The world's own record agrees, also where the plane that it is rolled out to lies on itself.
+    # The world's own record agrees, also where the plane that it is flattened to lies on itself.
     arc_from = report.along >= report.figures["arc_from"]
     assert distances_to_line(report.true_torch[arc_from], line).max() < 8e-3

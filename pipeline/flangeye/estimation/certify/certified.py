@@ -180,7 +180,7 @@ def _far_away(shown: Certificate, root: str, answer: CertifiedAnswer) -> str | N
     if not beyond.any():
         return None
     far = np.degrees(away[beyond].max())
-    return f"{NOT_CERTIFIED}: with its weights the best answer is {far:.2g} deg from it"
+    return f"{NOT_CERTIFIED}: the optimum for this answer's weights is {far:.2g} deg away from it"
 
 
 def _not_certifiable(answer: CertifiedAnswer) -> str:

@@ -233,7 +233,10 @@ class Probing:
         if abs(gain) > 0.35:
             return f"the finger's gain is off by {gain:.0%}, or the tip climbs the wall"
         if bend[0] > 0.1 + 3.0 * bend[1]:
-            return f"the tip climbs the wall: fully deflected the finger bends {bend[0]:.0%} less"
+            return (
+                f"the tip climbs the wall: at full deflection the finger shows {bend[0]:.0%} less "
+                "displacement than at small ones"
+            )
         from_wall = self._side * at
         middle = from_wall.min()
         if self._two_walls:
