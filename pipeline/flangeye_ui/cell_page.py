@@ -263,7 +263,7 @@ def _standards() -> list[str]:
 
 
 class Import:
-    """A model that is not listed: its file is made by the command that is shown."""
+    """Dialog for a model that is not listed; shows the command that makes its file."""
 
     def __init__(self, project: Project, form: Form, section: str, boxes: Boxes) -> None:
         self._project, self._form, self._section = project, form, section

@@ -91,7 +91,7 @@ class Recording:
 
     @property
     def passes_alone(self) -> bool:
-        """Whether the flange's trajectory around the capture is the only arm data."""
+        """Whether the arm is recorded only by the flange's trajectory around the capture."""
         return self.motion is not None and self.joints is None and set(self.poses) == {FLANGE}
 
 

@@ -122,7 +122,7 @@ def _sheet(workpiece: Workpiece, base_T_part: Floats, covered: float) -> SolidBo
 
 
 class StandingArm(Protocol):
-    """Interface: a simulated arm in the registry."""
+    """Interface of a simulated arm that the bench's scanner can see."""
 
     def state(self) -> RobotState:
         """Return the arm's reported state."""

@@ -294,7 +294,10 @@ def row_at(id_: str, role: str, pose: PlannedPose, eye: Floats) -> PlanRow:
 
 
 def left_out(refusals: Iterable[RefusedPose], poses: Iterable[PlannedPose]) -> list[PlanRow]:
-    """Return a row for each place without a possible pose, a few of every reason first."""
+    """Return a row with the reason for each place that has no possible pose.
+
+    Rows are sorted such that the first few show every reason.
+    """
     reasons = defaultdict[tuple[float, ...], Counter[str]](Counter)
     for refusal in refusals:
         reasons[_place(refusal.place)][refusal.reason] += 1

@@ -186,7 +186,7 @@ def check_usable(
 
 
 def log_source(log: RunLog, recordings: Sequence[Recording], cell: Cell | None = None) -> Source:
-    """Return the source of a log's captures: the log with its notes.
+    """Return where a log's captures come from, with the notes of the run that took them.
 
     Args:
         log: The log.

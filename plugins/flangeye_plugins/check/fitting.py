@@ -459,7 +459,7 @@ def moved_helps(session: RecordedSession, after: Mask) -> bool:
 
 
 def held_out_errors(equations: Equations, ignored: Mask) -> Floats:
-    """Return the errors (N, B) [m, rad] of each sample by the calibration without its fold.
+    """Return the errors (N, B) [m, rad] of each sample, predicted without its own fold.
 
     Args:
         equations: Equations of one variant.

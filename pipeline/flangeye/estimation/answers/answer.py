@@ -47,7 +47,7 @@ class Answer:
     shares: Mapping[str, Floats]
 
     def at(self, mean: Floats) -> Answer:
-        """Return these transforms at other values (P,), with the covariance there."""
+        """Return the answer at another mean (P,), with the mean squared error about it."""
         off = mean - self.mean
         return replace(self, mean=mean, covariance=self.covariance + np.outer(off, off))
 
@@ -91,7 +91,10 @@ def as_reported(found: Estimate, work: Work) -> Answer:
 
 
 def commanded(found: Estimate, work: Work) -> Floats:
-    """Return (B, P, K): how the effects move the places in reported coordinates, for each box."""
+    """Return the derivatives (B, P, K) of the places by the effects, one matrix a work box.
+
+    The places are those that are right in the coordinates that the arms report.
+    """
     return _Commands(found, work.around, work.boxes).answer()
 
 

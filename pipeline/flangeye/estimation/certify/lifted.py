@@ -191,9 +191,10 @@ class Quadratic:
         return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
 
     def alike(self, places: Floats) -> Floats:
-        """Return the features (m, n) of other places with the same cost as a minimum.
+        """Return the features (m, n) of a minimum and of other places with the same cost.
 
-        A circle may turn about its axis, and a point about any axis.
+        There are others where a target is symmetric: a circle may turn about its axis, and a
+        point about any axis.
         """
         moves = self.moves(places)
         able = np.flatnonzero(np.abs(moves).max(axis=0))

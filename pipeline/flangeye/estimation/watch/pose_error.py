@@ -72,7 +72,7 @@ class ArmPoseErrors:
 
     @property
     def beyond(self) -> Floats:
-        """Covariance (5, 5) of the noise."""
+        """Covariance (5, 5) of the noise of one pose: position [m^2], then tilt [rad^2]."""
         return np.diag(np.repeat(np.square(self.noise), (3, 2)))
 
 

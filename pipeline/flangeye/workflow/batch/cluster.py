@@ -276,7 +276,7 @@ class ChunkPacer:
         return max(1, int(wanted))
 
     def asks(self, chunks: int, sessions: int, share: float = 1.0) -> bool:
-        """Return whether to submit more sessions than these; ``share`` scales the limits."""
+        """Return whether to submit more, given what is submitted; ``share`` scales the limits."""
         if chunks < share * CHUNKS_AHEAD * self.workers():
             return True
         # Sessions that a scheduler elsewhere is to know of at least: its workers may only be

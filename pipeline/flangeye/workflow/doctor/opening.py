@@ -123,7 +123,7 @@ def examined(
     recipe: Recipe | None = None,
     checked: Callable[[], None] = lambda: None,
 ) -> Diagnosis:
-    """Return the mistakes in an archive: a cell's on its whole graph, others' by every check.
+    """Return the mistakes in an archive, by every check, or by those of cells for a cell.
 
     Args:
         path: A run.mcap, or a folder that a reader knows.

@@ -78,7 +78,7 @@ class FromNothing:
         return None
 
     def views(self) -> t.Views:
-        """Return the verification views that are there already."""
+        """Return the verification views of the earlier run."""
         return t.Views()
 
     def rejections(self) -> list[t.Rejection]:

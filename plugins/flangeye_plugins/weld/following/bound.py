@@ -83,7 +83,7 @@ class Predicted(NamedTuple):
         return self.fixed + self.askew + self.tip + self.felt
 
     def largest(self, at: int) -> str:
-        """Return the name of the largest part at the place with this index."""
+        """Return the name of the largest variance at place number ``at`` of the plan."""
         return max(REMEDIES, key=lambda name: float(getattr(self, name)[at]))
 
 
