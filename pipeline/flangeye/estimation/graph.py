@@ -214,7 +214,7 @@ class Problem:
         return Linear(residuals, turns, blocks)
 
     def following(self, carrier: Carrier) -> Linear:
-        """Return the linearisation by the twists (N, 6) of one carrier's frame; all else is fixed."""
+        """Return the linearisation by the twists (N, 6) of one carrier's frame, all else fixed."""
         eye = np.tile(np.eye(6), (len(self.seen), 1, 1))
         blocks = {c.frame: eye * (c is carrier) for c in self.carriers}
         return Linear(np.zeros(0), np.zeros(0), blocks)

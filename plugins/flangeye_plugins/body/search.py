@@ -343,7 +343,7 @@ class BodySearch:
         return self._distinct(found + self._searched(4))
 
     def quickly(self, trust: float) -> list[FoundPose]:
-        """Return as ``everywhere``, with less effort, poses with which ``trust`` of rays agree."""
+        """Return what ``everywhere`` does, by less effort, if a share ``trust`` of rays agree."""
         return self._searched(0.5, trust)
 
     def _searched(self, effort: float, trust: float = 0.0) -> list[FoundPose]:
