@@ -111,9 +111,9 @@ def test_foreign_text_makes_no_line_of_its_own() -> None:
 
 def test_a_refusal_has_three_parts() -> None:
     out = io.StringIO()
-    print_refusal(Console(file=out), "what", "how", ["do this", "or that", "never shown"])
+    print_refusal(Console(file=out), "what", "how", ["do this", "or that", "or else"])
     assert [line.split("  ")[0] for line in out.getvalue().splitlines()] == [
-        "What is wrong", "How it is known", "Next step", "or",
+        "What is wrong", "How it is known", "Next step", "or", "or",
     ]  # fmt: skip
     out.truncate(0)
     print_refusal(Console(file=out), "what", "how", ["do this", "and that"], "then")

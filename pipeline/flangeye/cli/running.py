@@ -187,7 +187,7 @@ def _explain_refusal(
     errors = with_urls(f"list each pose's error: flangeye show {quote(str(log.parent))} --outlook")
     if findings:
         named, tried, steps = combined_fix(findings)
-        print_refusal(Console(), named, tried or wrong, [*filter(None, steps[:2])] or [errors])
+        print_refusal(Console(), named, tried or wrong, [*filter(None, steps)] or [errors])
         return
     if failed := [step for step, good in passed.items() if not good]:
         known = f"{' and '.join(failed)} failed; {known}"

@@ -100,13 +100,13 @@ def _camera_of_several(result: Result) -> str:
 def print_refusal(
     console: Console, wrong: str, known: str, next_steps: Collection[str], joined: str = "or"
 ) -> None:
-    """Print what is wrong, how it is known, and one or two next steps with ``joined`` between."""
+    """Print what is wrong, how it is known, and the next step; ``joined`` is before each other."""
     write(console, wrapped(console, f"What is wrong     {wrong}", 18), "red")
     write(console, wrapped(console, f"How it is known   {known}", 18))
-    for name, step in zip(("Next step", joined), next_steps, strict=False):
-        if step.startswith(
-            ("- ", "configuration:", "feature:")
-        ):  # of the recipe, to paste as it stands
+    for number, step in enumerate(next_steps):
+        name = joined if number else "Next step"
+        # A line of the recipe, to paste as it stands
+        if step.startswith(("- ", "configuration:", "feature:")):
             write(console, f"{name:<15}   write in the recipe:\n  {step}")
         else:
             write(console, wrapped(console, f"{name:<15}   {step}", 18))
