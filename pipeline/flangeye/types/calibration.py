@@ -235,6 +235,9 @@ class Verification:
         figures: Named results in SI units.
         errors: Per-pose errors on poses that took no part [m], by observation id.
         advice: The next step after a failure; empty if the verification knows none.
+        units: Unit of each figure: ``m``, ``rad``, ``share``, ``relative`` (a ratio less 1), or
+            empty for a plain number. A report shows m in mm, rad in degrees, and so on; it
+            guesses the unit of a figure that is not listed from its name.
     """
 
     passed: bool
@@ -242,6 +245,7 @@ class Verification:
     figures: Mapping[str, float]
     errors: Mapping[str, float] = field(default_factory=dict)
     advice: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,9 +51,11 @@ def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
         "turn": float(np.linalg.norm(found.motion[:3])),
         "statistic": found.statistic,
     }
+    units = {"shift": "m", "turn": "rad", "statistic": ""}
     if found.state == "OK":
-        return Verification(True, f"scanner and arm are where {stored.path} found them", figures)
+        still = f"scanner and arm are where {stored.path} found them"
+        return Verification(True, still, figures, units=units)
     return Verification(
-        False, f"the cell has moved since {stored.path}, by {shift}", figures,
+        False, f"the cell has moved since {stored.path}, by {shift}", figures, units=units,
         advice="put the scanner back; or take verify.drift out of the recipe and use the new pose",
     )  # fmt: skip

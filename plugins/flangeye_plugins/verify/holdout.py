@@ -111,7 +111,9 @@ def verify_holdout(  # noqa: PLR0913  what it asks the runner for
     if misread:
         passed, (reason, advice) = False, misread
     errors = {o.id: float(norm) for o, norm in zip(poses, norms, strict=True)}
-    return Verification(passed, reason, figures, errors, advice)
+    units = dict.fromkeys(figures, "m") | dict.fromkeys(("folds", "poses", "outliers"), "")
+    units |= {"tilt_rms": "rad"}
+    return Verification(passed, reason, figures, errors, advice, units)
 
 
 def deal(count: int, folds: int, seed: int) -> list[Indices]:

@@ -167,7 +167,10 @@ def _judge(compared: Mapping[str, ViewComparison], params: IcpParams) -> Verific
         f"should be, {'within' if passed else 'beyond'} the limits of "
         f"{params.max_translation * 1e3:g} mm and {np.degrees(params.max_tilt):g} deg"
     )
-    return Verification(passed, reason, {**figures[worst], "views": float(len(errors))}, errors)
+    units = dict.fromkeys(figures[worst], "m") | {"overlap": "share", "views": ""}
+    units |= dict.fromkeys(("roll", "pitch", "yaw", "tilt", "clocking"), "rad")
+    shown = {**figures[worst], "views": float(len(errors))}
+    return Verification(passed, reason, shown, errors, units=units)
 
 
 def _figures(comparison: ViewComparison) -> dict[str, float]:

@@ -75,7 +75,8 @@ def verify_sphere(
         f"95 % of {figures['pairs']:.0f} distances agree to {figures['p95'] * 1e3:.3f} mm, {sign} "
         f"the limit of {params.max_error * 1e3:g} mm; scale {figures['scale'] * 1e6:+.0f} ppm"
     )
-    return Verification(passed, reason, figures)
+    units = dict.fromkeys(figures, "m") | {"pairs": "", "scale": "relative"}
+    return Verification(passed, reason, figures, units=units)
 
 
 def _of_bars(bars: Sequence[BallBar]) -> tuple[Floats, Floats]:

@@ -74,7 +74,8 @@ def verify_stitch(
         f"{figures['slide'] * 1e3:.3f} mm in the plane, {sign} {params.max_spread * 1e3:g} mm"
     )
     errors = {view.id: float(s) for view, s in zip(views, slides, strict=True)}
-    return Verification(passed, reason, figures, errors)
+    units = dict.fromkeys(figures, "m") | {"views": ""}
+    return Verification(passed, reason, figures, errors, units=units)
 
 
 def _in_flange(calibration: HandEye, views: Views, arm: Arm | None) -> list[Floats]:

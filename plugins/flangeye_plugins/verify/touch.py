@@ -67,7 +67,9 @@ def verify_touch(
     if stage_log:
         stage_log("comparison", _compared(errors))
     passed = figures["max"] <= params.max_error
-    return Verification(passed, _summary(figures, params.max_error, passed), figures, per_point)
+    units = dict.fromkeys(figures, "m") | {"points": "", "explained": "share"}
+    told = _summary(figures, params.max_error, passed)
+    return Verification(passed, told, figures, per_point, units=units)
 
 
 def _compared(errors: Floats) -> dict[str, object]:

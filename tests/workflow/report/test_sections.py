@@ -318,3 +318,15 @@ def test_numbers_for_people() -> None:
 )
 def test_a_check_s_figures_have_words_and_units(name: str, value: float, shown: str) -> None:
     assert f"{figure_name(name)} {figure(name, value)}".replace("\N{NO-BREAK SPACE}", " ") == shown
+
+
+@pytest.mark.parametrize(
+    ("unit", "shown"),
+    [("m", "1.000 mm"), ("rad", "0.0573 °"), ("share", "0%"), ("relative", "+1000 ppm"),
+     ("", "0.001")],
+)  # fmt: skip
+def test_a_figure_has_the_unit_that_its_check_declares(unit: str, shown: str) -> None:
+    """Whatever its name is: a slide in radians, or an index in metres."""
+    for name in ("slide", "acme_index"):
+        assert figure(name, 1e-3, {name: unit}).replace("\N{NO-BREAK SPACE}", " ") == shown
+    assert figure("slide", 1e-3, {"other": unit}).endswith("mm")

@@ -1,6 +1,7 @@
 """SI numbers as people read them in a report: millimetres, degrees, seconds."""
 
 import math
+from collections.abc import Mapping
 
 
 def millimetres(metres: float) -> str:
@@ -38,11 +39,28 @@ def figure_name(name: str) -> str:
     return " ".join(words.get(each, each) for each in name.split("_"))
 
 
-def figure(name: str, value: float) -> str:
-    """Return a verification's figure with its unit, which follows from its name.
+def figure(name: str, value: float, units: Mapping[str, str] | None = None) -> str:
+    """Return a verification's figure as people read it: m in mm, rad in degrees.
 
-    Figures are in SI; those with unknown names stay as they are.
+    Args:
+        name: Name of the figure.
+        value: The figure, in SI.
+        units: Units that the verification declares, by figure. Without one the name decides, and
+            a figure with an unknown name stays as it is.
     """
+    unit = _unit_by_name(name) if units is None or name not in units else units[name]
+    if unit == "rad":
+        return f"{degrees(value)}\N{NO-BREAK SPACE}\N{DEGREE SIGN}"
+    if unit == "m":
+        return f"{millimetres(value)}\N{NO-BREAK SPACE}mm"
+    if unit == "share":
+        return percent(value)
+    if unit == "relative":
+        return f"{value * 1e6:+.0f}\N{NO-BREAK SPACE}ppm"
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
+
+
+def _unit_by_name(name: str) -> str:
     angles = {"tilt", "angle", "rotation", "turn", "roll", "pitch", "yaw", "clocking"}
     lengths = {
         "rms", "median", "mean", "p95", "max", "worst", "distance", "offset", "sigma", "shift",
@@ -50,14 +68,12 @@ def figure(name: str, value: float) -> str:
     }  # fmt: skip
     words = set(name.split("_"))
     if words & angles:
-        return f"{degrees(value)}\N{NO-BREAK SPACE}\N{DEGREE SIGN}"
+        return "rad"
     if words & lengths:
-        return f"{millimetres(value)}\N{NO-BREAK SPACE}mm"
+        return "m"
     if words & {"overlap", "explained", "share"}:
-        return percent(value)
-    if name == "scale":
-        return f"{value * 1e6:+.0f}\N{NO-BREAK SPACE}ppm"
-    return f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
+        return "share"
+    return "relative" if name == "scale" else ""
 
 
 def percent(share: float) -> str:

@@ -138,6 +138,8 @@ class VerificationResult(_ResultPart):
     """Error of each pose [m], by observation id."""
     advice: str = ""
     """The next step after a failure; empty if the verification knows none."""
+    units: dict[str, str] = Field(default_factory=dict)
+    """Unit of each figure: m, rad, share, relative (a ratio less 1), or empty for a number."""
 
 
 class WorkspaceResult(_ResultPart):
