@@ -370,7 +370,7 @@ def _read_history(path):
 
     history = History.read(path, "a calibration")
     for finding in history.findings:
-        json.loads(as_json(history, finding))
+        json.loads(as_json(history, finding, False))
         sentence(finding)
     _axis(history)
     history.sightings()

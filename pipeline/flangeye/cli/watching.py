@@ -98,10 +98,10 @@ def monitor(  # noqa: PLR0913  one argument an option
             kept = History.read(place, stored.key)
             finding = take(stored, kept, check, test)
             kept.write()
-        say(as_json(kept, finding))
+        say(as_json(kept, finding, stored.simulated))
     if opcua:  # before the chart: a disk that is full keeps no cell going
         write_state(url, node, kept.findings[-1], opcua_security)
-    write_chart(kept, test, kept.path.with_suffix(".html"))
+    write_chart(kept, test, kept.path.with_suffix(".html"), stored.simulated)
     raise typer.Exit(CODES[kept.findings[-1].state])
 
 

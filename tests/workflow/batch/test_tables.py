@@ -19,7 +19,7 @@ from flangeye.workflow.batch.outcome import SessionOutcome
 from flangeye.workflow.batch.page import drawings_of, write_page
 from flangeye.workflow.batch.page import render as rendered
 from flangeye.workflow.batch.plan import BatchSession, Software
-from flangeye.workflow.batch.progress import Tally
+from flangeye.workflow.batch.progress import Batch, Tally, summary_text
 from flangeye.workflow.batch.work import Job
 
 EVIL = "<script>alert(1)</script>"
@@ -96,12 +96,22 @@ def test_csv_and_parquet_hold_the_same(entries: Any, tmp_path: Path) -> None:
     assert table.schema.field("archive").type == pa.string()
 
 
+def test_simulated_sessions_are_named_so(entries: Any) -> None:
+    assert "SIMULATED" not in render(entries)
+    (first, found), *others = entries
+    tally = tally_of([(first, replace(found, origin="simulated")), *others])
+    assert ">simulated</td>" in rendered(tally)
+    assert "SIMULATED: 1 of 3 sessions" in rendered(tally)
+    text = summary_text(Batch("out", tally, 0)).splitlines()[0]
+    assert text == "3 sessions: 2 verified, 1 failed (1 simulated)"
+
+
 def test_columns(entries: Any) -> None:
     assert tuple(columns(entries)) == (
         "session", "recipe", "archive", "steps.0.noise", "steps.0.count", "seed", "status",
         "reason", "used", "captures", "holdout_rms_m", "holdout_median_m", "holdout_p95_m",
         "expected_rms_m", "expected_p95_m", "true_rms_m", "true_centre_m", "true_rotation_rad",
-        "seconds", "report",
+        "seconds", "report", "origin",
     )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ def _kind(name: str, varied: Mapping[str, Sequence[str]]) -> ColumnType:
     if name in varied:
         kinds = {type(parse_value(text, name)) for text in varied[name]}
         return "int64" if kinds == {int} else "double" if kinds <= {int, float} else "string"
-    if name in ("session", "recipe", "archive", "status", "reason", "report"):
+    if name in ("session", "recipe", "archive", "status", "reason", "report", "origin"):
         return "string"
     return "int64" if name in ("seed", "used", "captures") else "double"
 

@@ -37,6 +37,7 @@ class SessionOutcome:
         true_rotation_rad: True error of the rotation.
         seconds: Duration of the session on its worker.
         report: Path of the session's report, relative to the batch's folder.
+        origin: ``simulated`` if a simulator made the captures.
     """
 
     status: Status
@@ -53,6 +54,7 @@ class SessionOutcome:
     true_rotation_rad: float | None = None
     seconds: float = 0.0
     report: str | None = None
+    origin: str | None = None
 
 
 def outcome_of(result: Result) -> SessionOutcome:
@@ -71,6 +73,7 @@ def outcome_of(result: Result) -> SessionOutcome:
         true_rms_m=truth.rms_over_workspace if truth else None,
         true_centre_m=truth.error_at_centroid if truth else None,
         true_rotation_rad=truth.rotation_error if truth else None,
+        origin="simulated" if result.simulated else None,
     )
 
 

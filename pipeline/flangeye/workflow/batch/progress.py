@@ -53,6 +53,7 @@ class Tally:
         columns: Names of the columns, in order.
         varied: Columns that the grid sets.
         total: Number of sessions.
+        simulated: Number of sessions whose captures a simulator made.
         seconds: Total duration of the sessions [s].
         recipe: Recipe of the first session, for the title.
         told: Columns with a value in any row.
@@ -67,7 +68,7 @@ class Tally:
         self, columns: Mapping[str, ColumnType], varied: Sequence[str], about: int
     ) -> None:
         self.columns, self.varied = tuple(columns), tuple(varied)
-        self.total, self.seconds, self.recipe = 0, 0.0, "nothing"
+        self.total, self.simulated, self.seconds, self.recipe = 0, 0, 0.0, "nothing"
         self.told: set[str] = set()
         self.sample: list[Row] = []
         self.common: Path | None = None
@@ -92,6 +93,7 @@ class Tally:
         every = np.arange(-self.total % self._step, len(table), self._step)
         self.sample += table.take(every).to_pylist()
         self.total += len(table)
+        self.simulated += len(table) - table["origin"].null_count
         self._add_archives(table)
         self._add_figures(table)
         self._add_variants(table)
@@ -208,7 +210,7 @@ class BatchProgress:
 
         self._console = console
         self._counts: Counter[Status] = Counter()
-        self._printed = 0
+        self._printed = self._simulated = 0
         self._progress = progress.Progress(
             progress.BarColumn(), progress.MofNCompleteColumn(),
             progress.TextColumn("{task.description}"),
@@ -231,10 +233,11 @@ class BatchProgress:
     def ended(self, told: ChunkDone) -> None:
         """Count the sessions of a chunk, and print the first errors."""
         self._counts.update(told.counts)
+        self._simulated += told.simulated
         for session, outcome in told.bad:
             self._print_failure(session, outcome)
-        done = told.counts.total()
-        self._progress.update(self._task, advance=done, description=count_text(self._counts))
+        done, text = told.counts.total(), count_text(self._counts, self._simulated)
+        self._progress.update(self._task, advance=done, description=text)
 
     def _print_failure(self, session: str, outcome: SessionOutcome) -> None:
         self._printed += 1
@@ -245,9 +248,10 @@ class BatchProgress:
             self.note("further sessions without a calibration are listed in sessions.csv only")
 
 
-def count_text(counts: Mapping[Status, int]) -> str:
-    """Return ``3 verified, 1 failed``."""
-    return ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts.get(s))
+def count_text(counts: Mapping[Status, int], simulated: int) -> str:
+    """Return ``3 verified, 1 failed (3 simulated)``."""
+    told = ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts.get(s))
+    return f"{told} ({simulated} simulated)" if simulated else told
 
 
 def summary_text(batch: Batch) -> str:
@@ -257,7 +261,7 @@ def summary_text(batch: Batch) -> str:
     figures = tally.figures()
     sessions = f"{tally.total} session{'s' if tally.total != 1 else ''}"
     lines = [
-        f"{sessions}: {count_text(tally.counts)}{earlier}",
+        f"{sessions}: {count_text(tally.counts, tally.simulated)}{earlier}",
         *_spread("held-out error", figures["holdout_rms_m"]),
         *_spread("true error", figures["true_rms_m"]),
         "",

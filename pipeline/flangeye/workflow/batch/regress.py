@@ -126,7 +126,7 @@ def _run(
 def _compared(
     name: str, expected: Expected, outcome: SessionOutcome, run: Path, registry: Registry
 ) -> ManifestComparison:
-    told: list[str] = [outcome.status]
+    told = [outcome.status if outcome.origin is None else f"{outcome.status} ({outcome.origin})"]
     differs: list[str] = []
     if outcome.status != expected.status:
         reason = f" ({outcome.reason})" if outcome.reason else ""

@@ -94,11 +94,13 @@ class ChunkDone:
         counts: Number of sessions by status.
         bad: Some of those without a calibration: id and outcome.
         seconds: Duration on its worker [s].
+        simulated: Number of sessions whose captures a simulator made.
     """
 
     counts: Counter[Status]
     bad: Sequence[tuple[str, SessionOutcome]]
     seconds: float
+    simulated: int = 0
 
 
 def run_chunk(job: Job, chunk: Chunk) -> ChunkDone:
@@ -125,7 +127,8 @@ def write_rows(job: Job, chunk: Chunk, outcomes: Sequence[SessionOutcome]) -> Ch
     Dataset(job.place, job.columns).write_part(chunk.block, part, rows)
     bad = [(session.id, o) for session, o in pairs if o.status not in ACCEPTED]
     # The console names this many failed sessions of a chunk at once; the rows have all
-    return ChunkDone(Counter(o.status for o in outcomes), bad[:11], 0.0)
+    simulated = sum(o.origin is not None for o in outcomes)
+    return ChunkDone(Counter(o.status for o in outcomes), bad[:11], 0.0, simulated)
 
 
 class Recipes:

@@ -125,18 +125,18 @@ def test_a_check_is_one_line_for_programs_in_millimetres_and_degrees(tmp_path: P
         1, state="MOVED", since=0, part="scanner", probability=0.87654, set_aside=("scan-7",)
     )
     made = history(tmp_path / "h.jsonl", finding(0), moved)
-    assert json.loads(as_json(made, moved)) == {
+    assert json.loads(as_json(made, moved, True)) == {
         "check": 1, "time": "2001-09-09T02:46:40+00:00", "source": "source 1", "sightings": 1,
-        "set_aside": ["scan-7"], "state": "MOVED", "shift_mm": 1.2346, "turn_deg": 5.0,
-        "since_check": 0, "since": "2001-09-09T01:46:40+00:00", "part": "scanner",
+        "set_aside": ["scan-7"], "state": "MOVED", "simulated": True,
+        "shift_mm": 1.2346, "turn_deg": 5.0, "since_check": 0, "since": "2001-09-09T01:46:40+00:00", "part": "scanner",
         "probability": 0.877, "statistic": 0.988,
     }  # fmt: skip
     turned = finding(0, motion=(np.radians(1.234567), 0.0, 0.0, 0.0, 0.0, 0.0))
-    told = json.loads(as_json(made, turned))
+    told = json.loads(as_json(made, turned, False))
     assert told["turn_deg"] == 1.23457
     assert [told[name] for name in ("since_check", "since", "part", "probability")] == 4 * [None]
     unknown = history(tmp_path / "h.jsonl", finding(0), times=[0])
-    assert json.loads(as_json(unknown, finding(0)))["time"] is None
+    assert json.loads(as_json(unknown, finding(0), False))["time"] is None
 
 
 def test_a_check_is_a_sentence() -> None:
@@ -254,6 +254,8 @@ def test_checks_without_a_time_of_their_own_are_placed_by_their_number(
 
 def test_the_chart_is_a_page_that_says_the_state_of_the_last_check(tmp_path: Path) -> None:
     made = history(tmp_path / "h.jsonl", finding(0), finding(1, state="MOVED", since=1))
-    write_chart(made, DriftTest(), tmp_path / "h.html")
+    write_chart(made, DriftTest(), tmp_path / "h.html", True)
+    assert "<h1>MOVED (simulated)</h1>" in (tmp_path / "h.html").read_text()
+    write_chart(made, DriftTest(), tmp_path / "h.html", False)
     page = (tmp_path / "h.html").read_text()
     assert "<h1>MOVED</h1>" in page and "since check 1" in page and "h.jsonl: 2." in page

@@ -18,8 +18,8 @@ STATE_COLOURS = {
 }
 
 
-def write_chart(history: History, test: DriftTest, path: Path) -> None:
-    """Write the chart of every check.
+def write_chart(history: History, test: DriftTest, path: Path, simulated: bool) -> None:
+    """Write the chart of every check; its title says whether the calibration is simulated.
 
     Raises:
         StageError: It cannot be written.
@@ -29,7 +29,8 @@ def write_chart(history: History, test: DriftTest, path: Path) -> None:
         ink=LIGHT["ink"], paper=LIGHT["paper"],
         state=last.state, colour=STATE_COLOURS[last.state], sentence=sentence(last),
         figure=figure(history, test).to_html(full_html=False, include_plotlyjs="inline"),
-        checks=len(history.findings), path=history.path, rate=test.false_alarms,
+        simulated=simulated, checks=len(history.findings), path=history.path,
+        rate=test.false_alarms,
     )  # fmt: skip
     write_whole(path, page)
 

@@ -206,8 +206,14 @@ def prints_of(seen: Sequence[t.Observation]) -> set[bytes]:
     return {each.feature.centre.tobytes() for each in seen}
 
 
-def as_json(history: History, finding: CheckFinding) -> str:
-    """Return one line about a check, for programs. Millimetres and degrees, named so."""
+def as_json(history: History, finding: CheckFinding, simulated: bool) -> str:
+    """Return one line about a check, for programs. Millimetres and degrees, named so.
+
+    Args:
+        history: The checks.
+        finding: What one of them found.
+        simulated: Whether the calibration is that of a simulated cell.
+    """
     check = history.checks[finding.check]
     since = None if finding.since is None else _when(history.checks[finding.since])
     return json.dumps(
@@ -218,6 +224,7 @@ def as_json(history: History, finding: CheckFinding) -> str:
             "sightings": len(check.seen),
             "set_aside": list(finding.set_aside),
             "state": finding.state,
+            "simulated": simulated,
             "shift_mm": round(finding.shift * 1e3, 4),
             "turn_deg": round(float(np.degrees(np.linalg.norm(finding.motion[:3]))), 5),
             "since_check": finding.since,

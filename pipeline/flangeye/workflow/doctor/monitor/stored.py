@@ -48,6 +48,11 @@ class StoredCalibration:
         return self.calibration.base_T_camera
 
     @property
+    def simulated(self) -> bool:
+        """Whether a simulator made the calibration's captures."""
+        return bool((self.log.result or {}).get("simulated"))
+
+    @property
     def key(self) -> str:
         """Key that is unique to this calibration."""
         return np.array2string(
