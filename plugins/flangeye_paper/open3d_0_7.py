@@ -71,6 +71,8 @@ def _defective(covariances: Floats) -> Floats:
     """Return the first column of ``(A - l0 I)(A - l1 I)``, normalised; z where it is zero."""
     largest, middle = _upper_eigenvalues(covariances)
     identity = np.eye(3)
+    # By Cayley and Hamilton the product's columns are multiples of the eigenvector of l2, the
+    # smallest. In a flat, round neighbourhood l0 = l1, and nothing but rounding is left of them.
     column = covariances[:, :, 0] - middle[:, None] * identity[0]
     shifted = covariances - largest[:, None, None] * identity
     product = sum(shifted[:, :, k] * column[:, k, None] for k in range(3))
@@ -91,6 +93,7 @@ def _upper_eigenvalues(matrices: Floats) -> tuple[Floats, Floats]:
     angle = np.arccos(np.clip(np.linalg.det(scaled) / 2, -1, 1)) / 3
     largest = mean + 2 * spread * np.cos(angle)
     smallest = mean + 2 * spread * np.cos(angle + 2 * np.pi / 3)
+    # Of a diagonal matrix the library reads the eigenvalues off: no rounding by the formula
     is_diagonal = off == 0
     largest = np.where(is_diagonal, diagonal.max(axis=1), largest)
     smallest = np.where(is_diagonal, diagonal.min(axis=1), smallest)
@@ -132,6 +135,7 @@ def icp(
     motion, moved = np.eye(4), source
     matched, nearest, share, rms = _matches(tree, moved, distance)
     for done in range(1, stop.iterations + 1):
+        # A motion has six unknowns
         if matched.sum() < 6:
             return None
         step = _step(moved[matched], target[nearest], normals[nearest])

@@ -107,6 +107,7 @@ def compensated(base_T_camera: Transform, error: PoseError, rotation: bool = Tru
         rotation: Whether its rotation counts; else only what it does where the flange was.
     """
     motion = error.motion if rotation else rigid(np.eye(3), error.displacement())
+    # On the right, equation (19): the error is a motion in the camera's frame
     return Transform(BASE, CAMERA, base_T_camera.matrix @ motion)
 
 
@@ -201,6 +202,7 @@ def refine_arm(
 def _identifiability(told: ArmParameters, session: Session) -> str:
     """Describe how well the poses determine the arm's errors."""
     poses = np.array([o.poses[FLANGE].matrix for o in session.observations])
+    # Two rotations R, S differ by the angle whose cosine is (trace(R'S) - 1) / 2
     cosine = (np.einsum("nij,mij->nm", poses[:, :3, :3], poses[:, :3, :3]).min() - 1) / 2
     widest = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     one = f" (one orientation: they turn by {widest:.1f} deg at most)" if widest < 10.0 else ""

@@ -66,6 +66,7 @@ class OpenCVCamera(Device):
         self._lost = self._closing = False
         self._lock = threading.Lock()
         self._check(finger)
+        # Drivers queue images: unless every one is read at once, the next is an old one
         self._thread = threading.Thread(target=self._read, name=self.name, daemon=True)
         self._thread.start()
 
@@ -115,7 +116,7 @@ class OpenCVCamera(Device):
 
     def _image(self, pixels: Any) -> Image:
         if pixels.ndim == 3:
-            pixels = np.ascontiguousarray(pixels[..., ::-1])
+            pixels = np.ascontiguousarray(pixels[..., ::-1])  # OpenCV's are BGR
         return Image(pixels, self.camera_matrix, self.distortion)
 
 

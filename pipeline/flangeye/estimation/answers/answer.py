@@ -48,7 +48,7 @@ class Answer:
 
     def at(self, mean: Floats) -> Answer:
         """Return the answer at another mean (P,), with the mean squared error about it."""
-        off = mean - self.mean
+        off = mean - self.mean  # a mean squared error is the covariance and the squared bias
         return replace(self, mean=mean, covariance=self.covariance + np.outer(off, off))
 
 

@@ -199,11 +199,12 @@ class Quadratic:
         moves = self.moves(places)
         able = np.flatnonzero(np.abs(moves).max(axis=0))
         _, sizes, ways = np.linalg.svd(self.root @ moves[:, able])
-        untold = ways[int((sizes > OBSERVABLE * sizes[0]).sum()) :]
+        # Directions in which the cost does not grow to second order
+        flat = ways[int((sizes > OBSERVABLE * sizes[0]).sum()) :]
         # Places that may be alike
-        steps = np.zeros((20 if len(untold) else 0, len(places), 6))
-        drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (len(steps), len(untold)))
-        steps.reshape(-1, 6 * len(places))[:, able] = drawn @ untold
+        steps = np.zeros((20 if len(flat) else 0, len(places), 6))
+        drawn = np.random.default_rng(0).uniform(-np.pi, np.pi, (len(steps), len(flat)))
+        steps.reshape(-1, 6 * len(places))[:, able] = drawn @ flat
         others = [self.descend(_moved(places, step)) for step in steps]
         # The share by which costs of alike places differ at most
         most = self.cost(places) * (1 + 1e-6)

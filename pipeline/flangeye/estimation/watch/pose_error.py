@@ -53,6 +53,7 @@ class ArmPoseErrors:
         turn = rotation_log(poses[:, :3, :3] @ self.middle[:3, :3].T)
         of_pose = features(np.concatenate([place, turn], axis=1) / self.lengths, POWERS)
         spread = (of_pose[:, None, :, None] * np.eye(3)[:, None, :]).reshape(len(poses), 3, -1)
+        # A rotation w moves the normal z by w x z; what of it lies across z is the tilt
         across = poses[:, :3, :2].transpose(0, 2, 1)
         tilts = across @ -hat(poses[:, :3, 2]) @ spread
         k = spread.shape[2]
