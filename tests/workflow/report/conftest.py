@@ -51,6 +51,7 @@ class Script:
     truth: bool = True
     finished: bool = True
     points: int = 3000
+    note: str = "two scans were empty"
 
 
 def scripted(script: Script, path: Path) -> RunLog:
@@ -59,7 +60,7 @@ def scripted(script: Script, path: Path) -> RunLog:
     truth = t.Truth(TRUTH) if script.truth else None
     source = t.Source(
         "sha256:0123",
-        ("two scans were empty",),
+        (script.note,),
         WORKSPACE,
         truth,
     )

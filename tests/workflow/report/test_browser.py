@@ -72,7 +72,7 @@ def test_a_narrow_screen_is_not_scrolled_sideways_and_the_matrix_can_be_copied(
     browser: Any, make_run: Callable[..., RunLog], tmp_path: Path
 ) -> None:
     path = tmp_path / "report.html"
-    log = make_run(ids=[f"{'x' * 90}{i}" for i in range(5)], clouds=False)
+    log = make_run(ids=[f"{'x' * 90}{i}" for i in range(5)], clouds=False, note="/" + "x" * 90)
     write_report(log, path)
     page = browser.new_page(viewport={"width": 420, "height": 900})
     page.goto(path.as_uri())
