@@ -104,8 +104,8 @@ def _rounded(seam: Seam, corners: list[Corner], params: WeldTactileParams, radiu
     """Return the plan with each corner replaced by an arc of this radius [m]."""
     if params.leg is not None:
         raise StageError(
-            "weld.tactile: with corner_radius the seam is welded in one, without legs; leave out "
-            "'corner_radius' or 'leg'"
+            "weld.tactile: with corner_radius the seam is welded in one go, without legs; leave "
+            "out 'corner_radius' or 'leg'"
         )
     points = seam.points_in_base
     along = arc_lengths(points)

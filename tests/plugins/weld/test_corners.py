@@ -119,7 +119,7 @@ def test_a_rounded_corner_is_an_arc_that_touches_both_legs(sampled) -> None:
 
 def test_a_plan_with_rounded_corners_has_no_legs() -> None:
     with pytest.raises(
-        StageError, match="with corner_radius the seam is welded in one, without legs"
+        StageError, match="with corner_radius the seam is welded in one go, without legs"
     ):
         leg_of(seam_of(polyline(90.0)), asked(**{**ROUND, "leg": 1}))
 

@@ -72,7 +72,7 @@ def adapter(cls: Any) -> TypeAdapter[Any]:
 
 
 def clouds_of(value: Any) -> dict[str, t.PointCloud]:
-    """Return the point clouds held directly by a flowing value, by field name."""
+    """Return the point clouds among the fields of a step's result, by field name."""
     if not dataclasses.is_dataclass(value):
         return {}
     held = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
