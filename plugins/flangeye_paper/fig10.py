@@ -8,7 +8,7 @@ from flangeye_paper import tables
 from flangeye_paper.fig9 import realised
 
 
-def fig10(batches: tables.Batches, out: tables.Out = Path()) -> None:
+def fig10(batches: tables.Batches, out: tables.OutOption = Path()) -> None:
     """Write fig10.csv, fig10_summary.csv and fig10.png.
 
     Args:

@@ -28,7 +28,9 @@ class Runs(NamedTuple):
     others_rms: Floats | None = None
 
 
-def fig11(batches: tables.Batches, archive: tables.Archive, out: tables.Out = Path()) -> None:
+def fig11(
+    batches: tables.Batches, archive: tables.FolderOption, out: tables.OutOption = Path()
+) -> None:
     """Write fig11.csv, fig11_summary.csv and fig11.png.
 
     Args:

@@ -104,7 +104,7 @@ Welds = Mapping[str, Sequence[SeenWeld]]
 """Welds by the method that followed the seam."""
 
 
-def fig13(batches: tables.Batches, out: tables.Out = Path()) -> None:
+def fig13(batches: tables.Batches, out: tables.OutOption = Path()) -> None:
     """Write fig13.csv and fig13.png.
 
     Args:

@@ -10,7 +10,7 @@ from flangeye.maths.statistics import rms
 from flangeye_paper import tables
 
 
-def fig9(batches: tables.Batches, out: tables.Out = Path()) -> None:
+def fig9(batches: tables.Batches, out: tables.OutOption = Path()) -> None:
     """Write fig9.csv, fig9_summary.csv, fig9_pools.csv and fig9.png.
 
     Args:

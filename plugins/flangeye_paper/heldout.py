@@ -42,7 +42,9 @@ RECORDINGS: Mapping[str, CentreSet] = {
 """Published centres by the name of the archive's last folder or file."""
 
 
-def heldout(batches: tables.Batches, archive: tables.Archive, out: tables.Out = Path()) -> None:
+def heldout(
+    batches: tables.Batches, archive: tables.FolderOption, out: tables.OutOption = Path()
+) -> None:
     """Write heldout.csv and heldout.png.
 
     Poses that solve.robust sets aside when it sees them all are left out of ``rms`` for every

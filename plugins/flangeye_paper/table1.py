@@ -13,7 +13,7 @@ ICP, STORED = "verify.icp_as_in_paper", "verify.stored_results_as_in_paper"
 NORMALS = {"open3d_0_7_normals": "defective normals", "sound": "sound normals"}
 
 
-def table1(batches: tables.Batches, out: tables.Out = Path()) -> None:
+def table1(batches: tables.Batches, out: tables.OutOption = Path()) -> None:
     """Write table1.csv, table1_iterations.csv and table1.png.
 
     Args:

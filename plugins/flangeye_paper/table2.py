@@ -33,7 +33,7 @@ class Trials(NamedTuple):
     refused: int
 
 
-def table2(batches: tables.Batches, out: tables.Out = Path()) -> None:
+def table2(batches: tables.Batches, out: tables.OutOption = Path()) -> None:
     """Write table2.csv and table2.png.
 
     Args:

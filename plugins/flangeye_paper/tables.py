@@ -14,8 +14,8 @@ from flangeye import FlangeyeError
 from flangeye.workflow.batch.outcome import ACCEPTED
 
 Batches = Annotated[Path, typer.Argument(help="Folder of the study's batches.")]
-Archive = Annotated[Path, typer.Option(help="The authors' published folder.")]
-Out = Annotated[Path, typer.Option(help="Folder for CSV files and pictures.")]
+FolderOption = Annotated[Path, typer.Option(help="The authors' published folder.")]
+OutOption = Annotated[Path, typer.Option(help="Folder for CSV files and pictures.")]
 Row = Mapping[str, Any]
 
 
