@@ -493,7 +493,7 @@ def test_a_mesh_of_another_size_is_refused_by_what_the_scan_shows(scale: float, 
     refused = fit_body(around(scan(GRIPPER), POSE), other, FitBodyParams(), SCANNER)
     assert isinstance(refused, Rejected)
     assert "in another size than its mesh" in refused.reason
-    figure = re.match(rf"{why} by (\S+)% at least", refused.figures)
+    figure = re.match(rf"{why} by at least (\S+)%", refused.figures)
     assert figure
     assert 0.3 < float(figure[1]) <= 1.0
 
