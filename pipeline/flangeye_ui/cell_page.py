@@ -492,10 +492,7 @@ IMPORTED: Mapping[str, Boxes] = {
     },
     "scanner": {
         "near": ("Minimum working distance, such as 300 mm", ui.input),
-        "far": (
-            "Maximum working distance, such as 900 mm; all below is optional",
-            ui.input,
-        ),
+        "far": ("Maximum working distance, such as 900 mm; all below is optional", ui.input),
         "principle": ("Principle", _principles),
         "pixels": ("Columns and rows, such as 1032, 772", ui.input),
         "field": ("Field of view, such as 60 deg, 45 deg", ui.input),

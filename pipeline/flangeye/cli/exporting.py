@@ -23,8 +23,7 @@ CameraOption = Annotated[
     str | None, typer.Option(help="Camera to export, for a cell with several.")
 ]
 Anyway = Annotated[
-    bool,
-    typer.Option("--anyway", help="Export a refused calibration too; the file states that."),
+    bool, typer.Option("--anyway", help="Export a refused calibration too; the file states that.")
 ]
 
 
@@ -87,8 +86,7 @@ def export(
 def publish(
     run: RunArgument,
     parent: Annotated[
-        str | None,
-        typer.Option(help="tf frame that carries the camera; by default the recipe's."),
+        str | None, typer.Option(help="tf frame that carries the camera; by default the recipe's.")
     ] = None,
     child: Annotated[
         str | None, typer.Option(help="tf frame of the camera; by default the recipe's.")

@@ -104,16 +104,13 @@ def emulator(  # noqa: PLR0913  one for each option
         ),
     ] = None,
     floor: Annotated[
-        str | None,
-        typer.Option(help="Height of a surface to touch, for example '100 mm'."),
+        str | None, typer.Option(help="Height of a surface to touch, for example '100 mm'.")
     ] = None,
     joints: Annotated[
-        str | None,
-        typer.Option(help="Initial joint angles, for example '0 -90 90 -90 -90 0 deg'."),
+        str | None, typer.Option(help="Initial joint angles, for example '0 -90 90 -90 -90 0 deg'.")
     ] = None,
     seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="Add random joint zero errors, drawn with this seed."),
+        int | None, typer.Option(min=0, help="Add random joint zero errors, drawn with this seed.")
     ] = None,
     with_input: Annotated[
         bool,

@@ -167,8 +167,7 @@ def watch(
     run: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RUN]",
-            help="Folder of a run, or its log. Default: the newest in ./runs.",
+            metavar="[RUN]", help="Folder of a run, or its log. Default: the newest in ./runs."
         ),
     ] = None,
     foxglove: Annotated[

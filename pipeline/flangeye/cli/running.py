@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 
 RecipeOrNone = Annotated[
-    str | None,
-    typer.Argument(help="A recipe file, or the name of a bundled recipe."),
+    str | None, typer.Argument(help="A recipe file, or the name of a bundled recipe.")
 ]
 RecordingsArgument = Annotated[
     str | None,
@@ -42,8 +41,7 @@ RecordingsArgument = Annotated[
 Results = Annotated[
     str | None,
     typer.Option(
-        metavar="PATH|URL",
-        help="Folder for the run's files; default runs/<time>_<recipe>.",
+        metavar="PATH|URL", help="Folder for the run's files; default runs/<time>_<recipe>."
     ),
 ]
 Sessions = Annotated[
@@ -63,8 +61,7 @@ FromOption = Annotated[
     typer.Option("--from", metavar="RUN.MCAP", help="Take the steps before --at from this log."),
 ]
 AtStep = Annotated[
-    str | None,
-    typer.Option(metavar="STEP", help="First step to run again, for example solve.svd."),
+    str | None, typer.Option(metavar="STEP", help="First step to run again, for example solve.svd.")
 ]
 Move = Annotated[
     bool,
@@ -86,12 +83,10 @@ Resume = Annotated[
     typer.Option(metavar="RUN", help="Resume a run that ended early: its folder, log or URL."),
 ]
 Retake = Annotated[
-    list[str] | None,
-    typer.Option(metavar="ID", help="With --resume: repeat this capture."),
+    list[str] | None, typer.Option(metavar="ID", help="With --resume: repeat this capture.")
 ]
 LeaveOut = Annotated[
-    list[str] | None,
-    typer.Option(metavar="ID", help="With --from: leave out this capture."),
+    list[str] | None, typer.Option(metavar="ID", help="With --from: leave out this capture.")
 ]
 
 

@@ -27,8 +27,7 @@ More = Annotated[
     typer.Argument(metavar="[NEW]...", help="Later scans too, as with --archive."),
 ]
 Move = Annotated[
-    bool,
-    typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan."),
+    bool, typer.Option("--move", help="Move the arm; without it, a dry run that prints the plan.")
 ]
 HistoryFile = Annotated[
     Path | None,

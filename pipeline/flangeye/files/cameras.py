@@ -185,11 +185,7 @@ def _matrix(values: Mapping[str, Any]) -> Floats | None:
 
 def _one_by_one(values: Mapping[str, Any]) -> Floats | None:
     # Names of single values: the usual ones, RealSense's, nerfstudio's
-    for names in (
-        ("fx", "fy", "cx", "cy"),
-        ("fx", "fy", "ppx", "ppy"),
-        ("flx", "fly", "cx", "cy"),
-    ):
+    for names in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("flx", "fly", "cx", "cy")):
         if all(_is_number(values.get(name)) for name in names):
             return _pinhole(*(float(values[name]) for name in names))
     if (focal := _numbers(values.get("focallength"))).size == 2:

@@ -132,10 +132,7 @@ def check_ids(archive: Archive) -> None:
 
 
 def check_poses(
-    root: Path,
-    recordings: Sequence[Recording],
-    whole: bool = False,
-    fewest: int = MIN_CAPTURES,
+    root: Path, recordings: Sequence[Recording], whole: bool = False, fewest: int = MIN_CAPTURES
 ) -> None:
     """Refuse implausible poses, and poses that are too few or too close together to calibrate.
 

@@ -43,15 +43,9 @@ def archive_at(place: str | None) -> Iterator[Path | None]:
     with TemporaryDirectory(prefix="flangeye-") as folder:
         within = place.partition("::")[0].partition("://")[2]
         root = Path(folder).resolve() / (PurePosixPath(within).name or "archive")
-        _STANDING_IN[root] = stand_in = _Mirror(place, root)
-        try:
+        with _standing_in(place, root) as stand_in:
             stand_in.lay_out()
             yield root
-        except FlangeyeError as error:
-            error.wrong, error.advice = with_urls(error.wrong), with_urls(error.advice)
-            raise
-        finally:
-            del _STANDING_IN[root]
 
 
 @contextmanager
@@ -70,17 +64,26 @@ def results_at(place: str | None) -> Iterator[Path | None]:
             raise StageError(f"{place}: already holds files; name a new or empty folder")
     with TemporaryDirectory(prefix="flangeye-") as folder:
         local = Path(folder).resolve() / "run"
-        _STANDING_IN[local] = _Mirror(place, local)
-        try:
-            yield local
-        except FlangeyeError as error:
-            error.wrong, error.advice = with_urls(error.wrong), with_urls(error.advice)
-            raise
-        finally:
-            if local.is_dir():
-                with one_line_errors(place):
-                    system.put(f"{local}/", f"{root.rstrip('/')}/", recursive=True)
-            del _STANDING_IN[local]
+        with _standing_in(place, local):
+            try:
+                yield local
+            finally:
+                if local.is_dir():
+                    with one_line_errors(place):
+                        system.put(f"{local}/", f"{root.rstrip('/')}/", recursive=True)
+
+
+@contextmanager
+def _standing_in(place: str, root: Path) -> Iterator["_Mirror"]:
+    """Let a local folder stand for a URL while the context lasts, in errors too."""
+    _STANDING_IN[root] = stand_in = _Mirror(place, root)
+    try:
+        yield stand_in
+    except FlangeyeError as error:
+        error.wrong, error.advice = with_urls(error.wrong), with_urls(error.advice)
+        raise
+    finally:
+        del _STANDING_IN[root]
 
 
 @contextmanager

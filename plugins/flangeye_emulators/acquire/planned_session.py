@@ -199,10 +199,7 @@ def _in_view(moments: Moments, count: int, view: CameraView) -> Moments:
 
 
 def source_of(
-    moments: Moments,
-    given: tuple[RobotModel, Configuration],
-    seed: int,
-    *models: Params | Flange,
+    moments: Moments, given: tuple[RobotModel, Configuration], seed: int, *models: Params | Flange
 ) -> Source:
     """Return the provenance of a session's captures, from its models and parameters."""
     robot, configuration = given

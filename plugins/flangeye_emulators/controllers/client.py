@@ -92,10 +92,7 @@ class EmulatorControl(Device):
         """Return the arm's true state at present."""
         said = self.ask("truth")
         return EmulatorTruth(
-            np.array(said["base_T_flange"]),
-            np.array(said["joints"]),
-            said["speed"],
-            said["time"],
+            np.array(said["base_T_flange"]), np.array(said["joints"]), said["speed"], said["time"]
         )
 
     def state(self) -> dict[str, Any]:

@@ -61,10 +61,7 @@ class BenchParams(LaidParams):
 
 
 def bench_with(
-    workpiece: Workpiece,
-    base_T_part: Floats,
-    covered: float,
-    rng: np.random.Generator,
+    workpiece: Workpiece, base_T_part: Floats, covered: float, rng: np.random.Generator
 ) -> list[SolidBody]:
     """Return the bodies of a bench with a workpiece, in ``base``.
 

@@ -44,10 +44,7 @@ _FLIPPED: Mapping[str, tuple[PoseChange, str]] = {
         "poses are flange_T_base (or the camera is on the flange where the recipe has it beside "
         "the arm, or the reverse)",
     ),
-    "transposed": (
-        transposed,
-        "rotations are transposed: matrices were stored column by column",
-    ),
+    "transposed": (transposed, "rotations are transposed: matrices were stored column by column"),
 }
 
 

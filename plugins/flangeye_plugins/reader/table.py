@@ -51,6 +51,9 @@ from flangeye_plugins.reader.columns import (
 )
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
+Stream = tuple[Floats, Floats]
+"""Times and poses of an arm."""
+
 BY_JOINTS = "joints"
 """Stands for a rotation: the poses follow from the joint angles."""
 
@@ -131,7 +134,8 @@ def table(path: Path, params: TableParams, kinematics: RobotModel | None = None)
     poses = _arm_poses(text, params, kinematics)
     if params.target is None:
         return _with_poses(_with_scans(folder, text, poses, params), text, poses)
-    return _with_poses(_measured(folder, text, poses, params), text, poses)
+    target = _target(folder, text, params.target)
+    return _with_poses(_measured(folder, text, poses, target, params), text, poses)
 
 
 def _with_poses(archive: Archive, text: Table, poses: Floats) -> Archive:
@@ -269,9 +273,10 @@ def _named(folder: Path, name: str) -> Path | None:
 # --- the target in the table
 
 
-def _measured(folder: Path, text: Table, poses: Floats, params: TableParams) -> Archive:
+def _measured(
+    folder: Path, text: Table, poses: Floats, target: Readings, params: TableParams
+) -> Archive:
     """Return poses with their measurements, joined row by row or by time."""
-    target = _target(folder, text, params)
     second = _second(folder, text, params)
     tables = [text, target.table, *([second.table] if second else [])]
     files = list(dict.fromkeys(file for table in tables for file in table.files))
@@ -321,10 +326,11 @@ def _joined(
         pairs, notes = pair(arm, events, signals, params.join)
     except StageError as error:
         raise StageError(f"{target.table.file}: {error}") from None
+    stream = None if second is None else _stream_of(second)
     recordings = [
         replace(
-            _recording(f"{i:04}", p.pose, p.mean(values), _second_at(second, p), p.time),
-            motion=_motion(arm, second, p),
+            _recording(f"{i:04}", p.pose, p.mean(values), _second_at(stream, p), p.time),
+            motion=_motion(arm, stream, p),
         )
         for i, p in enumerate(pairs)
     ]
@@ -343,22 +349,18 @@ def _with_joints(
     ]
 
 
-def _motion(
-    arm: tuple[Floats, Floats], second: Readings | None, found: MatchedPose
-) -> Motion | None:
+def _motion(arm: tuple[Floats, Floats], second: Stream | None, found: MatchedPose) -> Motion | None:
     """Return the arms' motion; None at rest."""
-    stream = None if second is None else _stream_of(second)
-    if found.motion is None or stream is None:
+    if found.motion is None or second is None:
         return found.motion
-    return passed(*arm, found.time, {FLANGE2: stream})
+    return passed(*arm, found.time, {FLANGE2: second})
 
 
-def _second_at(second: Readings | None, found: MatchedPose) -> Floats | None:
-    stream = None if second is None else _stream_of(second)
-    return None if stream is None else interpolated(*stream, np.array([found.time]))[0]
+def _second_at(second: Stream | None, found: MatchedPose) -> Floats | None:
+    return None if second is None else interpolated(*second, np.array([found.time]))[0]
 
 
-def _stream_of(readings: Readings) -> tuple[Floats, Floats] | None:
+def _stream_of(readings: Readings) -> Stream | None:
     """Return times and poses; None without times."""
     if readings.times is None:
         return None
@@ -381,9 +383,7 @@ def _poses(pose: Floats, second: Floats | None) -> dict[str, Floats]:
     return {FLANGE: pose} if second is None else {FLANGE: pose, FLANGE2: second}
 
 
-def _target(folder: Path, text: Table, params: TableParams) -> Readings:
-    given = params.target
-    assert given is not None  # noqa: S101  for type checkers: there is one, or nobody asks
+def _target(folder: Path, text: Table, given: TargetParams) -> Readings:
     turned = given.pose == "target_T_camera" and given.rotation != POINT
     return _other(folder, text, given, turned)
 

@@ -71,9 +71,7 @@ class OperatorConsole:
 class ManualParams(Params):
     """Parameters of ``robot.manual``."""
 
-    convention: str = Field(
-        description=f"How the pendant shows a pose: {', '.join(CONVENTIONS)}.",
-    )
+    convention: str = Field(description=f"How the pendant shows a pose: {', '.join(CONVENTIONS)}.")
     length: LengthUnit | None = None
     """Unit of the pendant's positions, where it is not the usual one."""
     # Distance from the requested pose beyond which the entry is queried [m]

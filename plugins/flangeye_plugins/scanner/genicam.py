@@ -24,7 +24,7 @@ from flangeye.devices import (
 )
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
-from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
+from flangeye_plugins.scanner.opened import OpenScanner, SerialParams, chosen
 
 ORGANISED = "CalibratedABC_Grid"
 """The output mode in which every pixel has its x, y and z."""
@@ -262,14 +262,8 @@ def _add(harvester: Any, path: Path) -> None:
 def _acquirer(harvester: Any, serial: str | None) -> Any:
     """Return the open device."""
     harvester.update()
-    found = {info.serial_number: info for info in harvester.device_info_list}
-    if not found:
-        raise DeviceError(f"{NAME}: no device found; is it on, and in this computer's network?")
-    if serial is None and len(found) > 1:
-        raise DeviceError(f"{NAME}: several devices, give serial: {', '.join(sorted(found))}")
-    wanted = serial or next(iter(found))
-    if wanted not in found:
-        raise DeviceError(f"{NAME}: no device {wanted}; there are: {', '.join(sorted(found))}")
+    found = [info.serial_number for info in harvester.device_info_list]
+    wanted = chosen(NAME, found, serial, kind="device")
     try:
         return harvester.create({"serial_number": wanted})
     except Exception as error:

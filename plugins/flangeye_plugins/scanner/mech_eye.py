@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from flangeye.devices import DeviceError, Scan, Scanner, load_sdk
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Params, part
-from flangeye_plugins.scanner.opened import OpenScanner
+from flangeye_plugins.scanner.opened import OpenScanner, chosen
 
 NAME = "scanner.mech_eye"
 
@@ -32,7 +32,10 @@ def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scann
     """
     api = load_sdk("mecheye.area_scan_3d_camera", NAME, "pip install 'flangeye[mech_eye]'")
     camera, patience = api.Camera(), round(params.timeout * 1e3)
-    address = params.address or _only_camera(api, patience)
+    address = params.address
+    if address is None:
+        found = [info.ip_address for info in api.Camera.discover_cameras(patience)]
+        address = chosen(NAME, found, None, give="address")
     _require(camera.connect(address, patience), f"{NAME}: {address}")
     scanner = MechEye(api, camera, model, params)
     try:
@@ -41,15 +44,6 @@ def scanner_mech_eye(model: ScannerModel | None, params: MechEyeParams) -> Scann
         scanner.close()
         raise
     return scanner
-
-
-def _only_camera(api: Any, patience: int) -> str:
-    found = [info.ip_address for info in api.Camera.discover_cameras(patience)]
-    if not found:
-        raise DeviceError(f"{NAME}: no camera found; is it on, and in this computer's network?")
-    if len(found) > 1:
-        raise DeviceError(f"{NAME}: several cameras, give address: {', '.join(sorted(found))}")
-    return str(found[0])
 
 
 def _require(status: Any, what: str) -> None:

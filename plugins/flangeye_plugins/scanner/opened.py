@@ -1,6 +1,6 @@
 """Common parts of scanner drivers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,6 +95,37 @@ class SerialParams(Params):
 
     serial: str | None = None
     """Serial number of the camera, if there are several."""
+
+
+def chosen(
+    name: str,
+    found: Iterable[str],
+    wanted: str | None,
+    look: str = "is it on, and in this computer's network?",
+    kind: str = "camera",
+    give: str = "serial",
+) -> str:
+    """Return the name of the wanted device, or of the only one.
+
+    Args:
+        name: The driver's name.
+        found: Names of the devices that are there.
+        wanted: The device that the recipe names; None if it names none.
+        look: What to look at if there is none.
+        kind: What these devices are.
+        give: The driver's parameter that names one.
+
+    Raises:
+        DeviceError: There is none, there are several, or none has the name.
+    """
+    known = sorted(found)
+    if not known:
+        raise DeviceError(f"{name}: no {kind} found; {look}")
+    if wanted is None and len(known) > 1:
+        raise DeviceError(f"{name}: several {kind}s, give {give}: {', '.join(known)}")
+    if wanted not in (None, *known):
+        raise DeviceError(f"{name}: no {kind} {wanted}; there are: {', '.join(known)}")
+    return wanted or known[0]
 
 
 def cloud_of(xyz: NDArray[Any], per_metre: float) -> PointCloud:

@@ -12,7 +12,7 @@ from flangeye.devices import PATIENCE, DeviceError, Scan, Scanner, load_sdk
 from flangeye.files.paths import RecipeFile
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import part
-from flangeye_plugins.scanner.opened import OpenScanner, SerialParams
+from flangeye_plugins.scanner.opened import OpenScanner, SerialParams, chosen
 
 NAME = "scanner.realsense"
 
@@ -55,17 +55,8 @@ def scanner_realsense(model: ScannerModel | None, params: RealsenseParams) -> Sc
 def _serial(rs: Any, wanted: str | None) -> str:
     """Return the serial number of the camera; without a camera raise at once, not after 15 s."""
     devices = rs.context().query_devices()
-    found = sorted(device.get_info(rs.camera_info.serial_number) for device in devices)
-    if not found:
-        raise DeviceError(
-            f"{NAME}: no camera found; is it plugged in, and may this user use USB devices?"
-        )
-    if wanted is None and len(found) == 1:
-        return str(found[0])
-    if wanted is None or wanted not in found:
-        problem = f"no camera {wanted}; there are" if wanted else "several cameras, give serial"
-        raise DeviceError(f"{NAME}: {problem}: {', '.join(found)}")
-    return str(wanted)
+    found = [device.get_info(rs.camera_info.serial_number) for device in devices]
+    return chosen(NAME, found, wanted, "is it plugged in, and may this user use USB devices?")
 
 
 class Realsense(OpenScanner):

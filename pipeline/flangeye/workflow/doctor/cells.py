@@ -35,13 +35,7 @@ from flangeye.types import (
     Transform,
 )
 from flangeye.types.pose_formats import LENGTHS, describe_rotation, other_conventions
-from flangeye.workflow.doctor.diagnosis import (
-    Diagnosis,
-    Finding,
-    Misfit,
-    as_yaml,
-    require_enough,
-)
+from flangeye.workflow.doctor.diagnosis import Diagnosis, Finding, Misfit, as_yaml, require_enough
 from flangeye.workflow.log.read import is_log, log_of, read_run
 from flangeye.workflow.recipe.load import Recipe, parse_recipe
 from flangeye.workflow.run.folder import recipe_of_log

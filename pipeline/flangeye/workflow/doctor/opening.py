@@ -517,10 +517,7 @@ def _seen_by(archive: Archive, first: Step, recipe: Recipe, registry: Registry) 
 def _with_stand_in_poses(archive: Archive) -> Archive:
     # 10 mm apart, half a metre above the base: no two alike, and every one within reach
     recordings = [
-        replace(
-            recording,
-            poses={t.FLANGE: rigid(np.eye(3), np.array([0.01 * i, 0.0, 0.5]))},
-        )
+        replace(recording, poses={t.FLANGE: rigid(np.eye(3), np.array([0.01 * i, 0.0, 0.5]))})
         for i, recording in enumerate(archive.recordings)
     ]
     return replace(archive, recordings=recordings)

@@ -61,9 +61,7 @@ SECTIONS: Mapping[Any, Given] = {
     TargetBody: Given("a body to look for", ("target",), "target: {body: gripper.stl, at: flange}"),
     t.Seed: Given("a seed", ("seed",), "seed: 0"),
     Configuration: Given(
-        "a configuration",
-        ("configuration",),
-        "configuration: {name: eye-in-hand, place: unknown}",
+        "a configuration", ("configuration",), "configuration: {name: eye-in-hand, place: unknown}"
     ),
     Cell: Given(
         "a cell",

@@ -229,8 +229,7 @@ def set_aside_of(facts: Facts) -> SetAside:
         shared = by_stage.reason if by_stage else reason
         # Reasons that differ in numbers alone are one; the 6 of M6 is none
         kinds[
-            stage,
-            re.sub(r"(?<![\w.])[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?(?!\w)", "…", shared),
+            stage, re.sub(r"(?<![\w.])[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?(?!\w)", "…", shared)
         ].append(shared)
     counts = [(len(alike), stage, _first_of(alike)) for (stage, _), alike in kinds.items()]
     counts.sort(key=lambda each: -each[0])

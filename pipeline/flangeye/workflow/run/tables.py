@@ -195,10 +195,7 @@ def _noise(seen: Sequence[Observation]) -> dict[str, str]:
     if not turns:
         return {"centre_noise": f"{shift * 1e3:.4g} mm"}
     turn = np.median([_deviation(covariance) for covariance in turns])
-    return {
-        "position_noise": f"{shift * 1e3:.4g} mm",
-        "angle_noise": f"{np.degrees(turn):.4g} deg",
-    }
+    return {"position_noise": f"{shift * 1e3:.4g} mm", "angle_noise": f"{np.degrees(turn):.4g} deg"}
 
 
 def _deviation(covariance: Any) -> float:

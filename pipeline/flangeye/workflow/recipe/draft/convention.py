@@ -180,10 +180,8 @@ def _arm(
 ) -> PoseColumns:
     """Return the columns of the arm's poses."""
     asked = questions.given.get("table")
-    given, joints = (
-        questions.given.get("columns"),
-        questions.given.get("rotation") == JOINTS_ONLY[0],
-    )
+    given = questions.given.get("columns")
+    joints = questions.given.get("rotation") == JOINTS_ONLY[0]
     if given is not None:
         table = _table_of(tables, found, questions)
         own = [pose for pose in found if pose.table is table]
@@ -211,10 +209,7 @@ def _arm(
 def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumns:
     """Return the pose columns that are the arm's, judged by name."""
     named = [p for p in poses if p.role == "arm"]
-    nobody = [p for p in poses if p.role is None]
-    likely = named or nobody
-    if not likely:
-        likely = list(poses)
+    likely = named or [p for p in poses if p.role is None] or list(poses)
     upright = [p for p in likely if not (p.frames and is_inverse(p.frames))] or likely
     first = upright[0]
     if len(likely) > 1 and named:
@@ -230,10 +225,7 @@ def _likeliest(poses: Sequence[PoseColumns], questions: Questions) -> PoseColumn
         question = f"which poses are the arm's ({known})"
         names = [name for p in likely for name in (p.name, p.table.name)]
         answer = questions.ask("table", question, None, likely[0].name, one_of(*names))
-        matching = [p for p in likely if answer in (p.name, p.table.name)]
-        if not matching:
-            raise RecipeError(f"--table {answer}: is not a table of poses; known: {known}")
-        first = matching[0]
+        first = next(p for p in likely if answer in (p.name, p.table.name))
     if first.guess:
         questions.assumed.append(f"{first.table.name}: {first.guess} (--columns changes it)")
     return first
@@ -295,10 +287,7 @@ def _named(
 
 
 def _target(
-    tables: Sequence[Table],
-    found: Sequence[PoseColumns],
-    arm: PoseColumns,
-    questions: Questions,
+    tables: Sequence[Table], found: Sequence[PoseColumns], arm: PoseColumns, questions: Questions
 ) -> PoseColumns | None:
     """Return the target's columns: by name, or else others with the same number of rows."""
     given = questions.given.get("target-columns")

@@ -112,11 +112,7 @@ def _is_matrix(numbers: Floats) -> bool:
     return any(_orthonormal(numbers[:, part]) for part in _MATRICES.values())
 
 
-_MATRICES = {
-    "matrix": [0, 1, 2, 4, 5, 6, 8, 9, 10],
-    "3x3": [*range(3, 12)],
-    "first": [*range(9)],
-}
+_MATRICES = {"matrix": [0, 1, 2, 4, 5, 6, 8, 9, 10], "3x3": [*range(3, 12)], "first": [*range(9)]}
 """Where the nine numbers of a rotation may stand among twelve."""
 
 

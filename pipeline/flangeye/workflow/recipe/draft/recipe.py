@@ -367,11 +367,7 @@ def _target(answer: str) -> dict[str, Any]:
 
 
 def _head(
-    folder: Path,
-    out: Path,
-    robot: dict[str, Any],
-    target: dict[str, Any],
-    questions: Questions,
+    folder: Path, out: Path, robot: dict[str, Any], target: dict[str, Any], questions: Questions
 ) -> dict[str, Any]:
     """Return the recipe's sections above its steps."""
     head: dict[str, Any] = {"title": f"Calibration from {folder.resolve().name}"}

@@ -154,10 +154,7 @@ class FolderSurvey:
             for what, paths in (
                 ("clouds", self.clouds),
                 ("images", self.images),
-                (
-                    "not read",
-                    [p for p in self.of(unread) if p not in read],
-                ),
+                ("not read", [p for p in self.of(unread) if p not in read]),
             )
             if (kinds := Counter(p.suffix.lower() for p in paths))
         ]

@@ -20,7 +20,7 @@ from flangeye.maths.statistics import corners_of
 from flangeye.models.scanners import ScannerModel
 from flangeye.types import Floats
 from flangeye.types.geometry import levers
-from flangeye.workflow.result.contract import Result, TransformResult
+from flangeye.workflow.result.contract import Result, TransformResult, WorkspaceResult
 
 
 def propagated(sensitivities: Floats, standard: Floats, correlation: Floats) -> Floats:
@@ -197,7 +197,7 @@ def use_budget_of(
     """Return the budget of one point that is scanned and then driven to."""
     calibration = budget_of(result)
     parts = [
-        *_of_calibration(calibration),
+        *_each_axis("Calibration", "A", calibration.standard, "the table above"),
         *_of_one_pose(result),
         *(_each_axis(*_distortion(scanner)) if scanner else ()),
         *(
@@ -272,24 +272,21 @@ def _estimate_of(result: Result) -> tuple[str, TransformResult]:
 def _worst_corner(result: Result, estimate: TransformResult) -> Floats:
     if result.workspace is None:
         raise StageError("nothing says where the work is: give the recipe a 'workspace'")
-    box = result.workspace
-    corners = corners_of(np.array(box.centre), np.array(box.size))
     # The variance is a convex function of the place, so over a box it is largest at a corner
-    motions = levers(corners - np.array(estimate.about))
-    variances = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions)
+    corners, variances = _at_corners(result.workspace, estimate)
     return np.asarray(corners[int(variances.argmax())])
+
+
+def _at_corners(box: WorkspaceResult, estimate: TransformResult) -> tuple[Floats, Floats]:
+    """Return the corners of the workspace (8, 3), and the variance of the calibration at each."""
+    corners = corners_of(np.array(box.centre), np.array(box.size))
+    motions = levers(corners - np.array(estimate.about))
+    return corners, np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions)
 
 
 def _evidence(result: Result) -> str:
     used = sum(o.used for o in result.observations)
     return f"{result.method or 'solver'}, {used} poses; covariance in result.json"
-
-
-def _of_calibration(budget: Budget) -> list[Contribution]:
-    return [
-        Contribution(f"Calibration, {axis}", "A", float(u), "m", unit, np.inf, "the table above")
-        for axis, u, unit in zip("xyz", budget.standard, np.eye(3), strict=True)
-    ]
 
 
 def _of_one_pose(result: Result) -> list[Contribution]:
@@ -299,9 +296,7 @@ def _of_one_pose(result: Result) -> list[Contribution]:
         return []
     poses = held.figures.get("poses", 0.0) - held.figures.get("outliers", 0.0)
     _, estimate = _estimate_of(result)
-    corners = corners_of(np.array(box.centre), np.array(box.size))
-    motions = levers(corners - np.array(estimate.about))
-    own = np.einsum("nia,ab,nib->n", motions, np.array(estimate.covariance), motions).mean()
+    own = _at_corners(box, estimate)[1].mean()
     # A smaller difference than the standard error of the held-out variance is not detected: then
     # that error is stated, as a bound
     hidden = _standard_error(held.rms**2, int(3 * poses))
@@ -329,10 +324,14 @@ def _expansion(point: Floats, spread: float) -> tuple[str, Literal["B"], float, 
 
 
 def _each_axis(
-    name: str, kind: Literal["A", "B"], standard: float, evidence: str, freedom: float = np.inf
+    name: str,
+    kind: Literal["A", "B"],
+    standard: float | Floats,
+    evidence: str,
+    freedom: float = np.inf,
 ) -> list[Contribution]:
-    """Return a contribution of equal size and independent along x, y and z."""
+    """Return a contribution that is independent along x, y and z, of one size or three."""
     return [
-        Contribution(f"{name}, {axis}", kind, float(standard), "m", unit, freedom or 1.0, evidence)
-        for axis, unit in zip("xyz", np.eye(3), strict=True)
+        Contribution(f"{name}, {axis}", kind, float(u), "m", unit, freedom or 1.0, evidence)
+        for axis, u, unit in zip("xyz", np.broadcast_to(standard, 3), np.eye(3), strict=True)
     ]
