@@ -15,33 +15,42 @@ from typing import Any
 import numpy as np
 
 from flangeye import types as t
-from flangeye.testing.base import Conformance as Conformance
 from flangeye.testing.base import (
+    Conformance,
     require,
     require_close,
     require_refusal,
     require_repeats,
     require_type,
 )
-from flangeye.testing.devices import ArcConformance as ArcConformance
-from flangeye.testing.devices import ProfilerConformance as ProfilerConformance
-from flangeye.testing.devices import RobotConformance as RobotConformance
-from flangeye.testing.devices import ScannerConformance as ScannerConformance
-from flangeye.testing.devices import SensorConformance as SensorConformance
-from flangeye.testing.percapture import FitConformance as FitConformance
-from flangeye.testing.percapture import SegmentConformance as SegmentConformance
-from flangeye.testing.solving import TRUE_CAMERA, observed, work_points
-from flangeye.testing.solving import RefineConformance as RefineConformance
-from flangeye.testing.solving import SolveConformance as SolveConformance
-from flangeye.testing.solving import VerifyConformance as VerifyConformance
-from flangeye.testing.sources import AcquireConformance as AcquireConformance
-from flangeye.testing.sources import PlanConformance as PlanConformance
-from flangeye.testing.sources import ReaderConformance as ReaderConformance
-from flangeye.testing.sources import ViewConformance as ViewConformance
-from flangeye.testing.welding import ControllerConformance as ControllerConformance
-from flangeye.testing.welding import ScanConformance as ScanConformance
-from flangeye.testing.welding import SeamConformance as SeamConformance
-from flangeye.testing.welding import WeldConformance as WeldConformance
+from flangeye.testing.devices import (
+    ArcConformance,
+    ProfilerConformance,
+    RobotConformance,
+    ScannerConformance,
+    SensorConformance,
+)
+from flangeye.testing.percapture import FitConformance, SegmentConformance
+from flangeye.testing.solving import (
+    TRUE_CAMERA,
+    RefineConformance,
+    SolveConformance,
+    VerifyConformance,
+    observed,
+    work_points,
+)
+from flangeye.testing.sources import (
+    AcquireConformance,
+    PlanConformance,
+    ReaderConformance,
+    ViewConformance,
+)
+from flangeye.testing.welding import (
+    ControllerConformance,
+    ScanConformance,
+    SeamConformance,
+    WeldConformance,
+)
 from flangeye.types import Floats
 from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy
 from flangeye.workflow.doctor.diagnosis import Finding, NotApplicable, RecordedSession
@@ -248,10 +257,38 @@ class ExportConformance(Conformance):
 
 
 # Spelt out: a type checker takes nothing else for public.
+__all__ = [
+    "KITS",
+    "AcquireConformance",
+    "ArcConformance",
+    "CheckConformance",
+    "Conformance",
+    "ControllerConformance",
+    "CostConformance",
+    "ErrorConformance",
+    "ExportConformance",
+    "FitConformance",
+    "GuideConformance",
+    "PlanConformance",
+    "ProfilerConformance",
+    "ReaderConformance",
+    "RefineConformance",
+    "ReplayConformance",
+    "RobotConformance",
+    "ScanConformance",
+    "ScannerConformance",
+    "SeamConformance",
+    "SegmentConformance",
+    "SensorConformance",
+    "SolveConformance",
+    "VerifyConformance",
+    "ViewConformance",
+    "WeldConformance",
+]
 
 KITS: Mapping[str, type[Conformance]] = {
     kit.kind: kit
-    for kit in list(globals().values())
+    for kit in map(globals().get, __all__)
     if isinstance(kit, type) and issubclass(kit, Conformance) and kit.kind
 }
 """Kind of stage or part -> its class."""

@@ -24,64 +24,138 @@ from typing import Any, NewType, Protocol
 
 import numpy as np
 
-from flangeye.types.arrays import Array as Array
-from flangeye.types.arrays import FloatArray as FloatArray
-from flangeye.types.arrays import Floats as Floats
-from flangeye.types.arrays import Indices as Indices
-from flangeye.types.arrays import Mask as Mask
-from flangeye.types.arrays import Note as Note
-from flangeye.types.arrays import Pixels as Pixels
-from flangeye.types.arrays import Singles as Singles
-from flangeye.types.arrays import Warn as Warn
-from flangeye.types.arrays import freeze
-from flangeye.types.arrays import records_of as records_of
-from flangeye.types.arrays import warnings_of as warnings_of
-from flangeye.types.calibration import ArmCorrection as ArmCorrection
-from flangeye.types.calibration import CorrectedArm as CorrectedArm
-from flangeye.types.calibration import ExpectedError as ExpectedError
-from flangeye.types.calibration import HandEye as HandEye
-from flangeye.types.calibration import Pair as Pair
-from flangeye.types.calibration import PoseError as PoseError
-from flangeye.types.calibration import SmoothField as SmoothField
-from flangeye.types.calibration import Solver as Solver
-from flangeye.types.calibration import Verification as Verification
-from flangeye.types.calibration import VerifiedHandEye as VerifiedHandEye
-from flangeye.types.features import CircleFeature as CircleFeature
-from flangeye.types.features import Feature as Feature
-from flangeye.types.features import Observation as Observation
-from flangeye.types.features import PoseFeature as PoseFeature
-from flangeye.types.features import Rejected as Rejected
-from flangeye.types.features import Rejection as Rejection
-from flangeye.types.features import VerificationView as VerificationView
-from flangeye.types.frames import BASE as BASE
-from flangeye.types.frames import BASE2 as BASE2
-from flangeye.types.frames import CAMERA as CAMERA
-from flangeye.types.frames import FLANGE as FLANGE
-from flangeye.types.frames import FLANGE2 as FLANGE2
-from flangeye.types.frames import TARGET as TARGET
-from flangeye.types.frames import TOOL as TOOL
-from flangeye.types.frames import Box as Box
-from flangeye.types.frames import FrameMismatchError as FrameMismatchError
-from flangeye.types.frames import Motion as Motion
-from flangeye.types.frames import PointCloud as PointCloud
-from flangeye.types.frames import Poses as Poses
-from flangeye.types.frames import Transform as Transform
-from flangeye.types.frames import TransformEstimate as TransformEstimate
-from flangeye.types.frames import by_frame as by_frame
-from flangeye.types.scans import Capture as Capture
-from flangeye.types.scans import FlangeCloud as FlangeCloud
-from flangeye.types.scans import Image as Image
-from flangeye.types.scans import Role as Role
-from flangeye.types.scans import ScanPlace as ScanPlace
-from flangeye.types.scans import WorkpieceScan as WorkpieceScan
-from flangeye.types.streams import Captures as Captures
-from flangeye.types.streams import Earlier as Earlier
-from flangeye.types.streams import Look as Look
-from flangeye.types.streams import Observations as Observations
-from flangeye.types.streams import Source as Source
-from flangeye.types.streams import Stream as Stream
-from flangeye.types.streams import Truth as Truth
-from flangeye.types.streams import Views as Views
+from flangeye.types.arrays import (
+    Array,
+    FloatArray,
+    Floats,
+    Indices,
+    Mask,
+    Note,
+    Pixels,
+    Singles,
+    Warn,
+    freeze,
+    records_of,
+    warnings_of,
+)
+from flangeye.types.calibration import (
+    ArmCorrection,
+    CorrectedArm,
+    ExpectedError,
+    HandEye,
+    Pair,
+    PoseError,
+    SmoothField,
+    Solver,
+    Verification,
+    VerifiedHandEye,
+)
+from flangeye.types.features import (
+    CircleFeature,
+    Feature,
+    Observation,
+    PoseFeature,
+    Rejected,
+    Rejection,
+    VerificationView,
+)
+from flangeye.types.frames import (
+    BASE,
+    BASE2,
+    CAMERA,
+    FLANGE,
+    FLANGE2,
+    TARGET,
+    TOOL,
+    Box,
+    FrameMismatchError,
+    Motion,
+    PointCloud,
+    Poses,
+    Transform,
+    TransformEstimate,
+    by_frame,
+)
+from flangeye.types.scans import Capture, FlangeCloud, Image, Role, ScanPlace, WorkpieceScan
+from flangeye.types.streams import (
+    Captures,
+    Earlier,
+    Look,
+    Observations,
+    Source,
+    Stream,
+    Truth,
+    Views,
+)
+
+__all__ = [
+    "BASE",
+    "BASE2",
+    "CAMERA",
+    "FLANGE",
+    "FLANGE2",
+    "TARGET",
+    "TOOL",
+    "ArchivePath",
+    "ArmCorrection",
+    "Array",
+    "Box",
+    "CalibratedPose",
+    "Capture",
+    "Captures",
+    "CircleFeature",
+    "CorrectedArm",
+    "Earlier",
+    "ExpectedError",
+    "ExportedFile",
+    "Feature",
+    "FlangeCloud",
+    "FloatArray",
+    "Floats",
+    "FrameMismatchError",
+    "HandEye",
+    "Image",
+    "Indices",
+    "Look",
+    "Mask",
+    "Motion",
+    "Note",
+    "Observation",
+    "Observations",
+    "Pair",
+    "Pixels",
+    "PointCloud",
+    "PoseError",
+    "PoseFeature",
+    "Poses",
+    "Progress",
+    "Rejected",
+    "Rejection",
+    "Resumed",
+    "Role",
+    "ScanPlace",
+    "Seam",
+    "Seed",
+    "Singles",
+    "SmoothField",
+    "Solver",
+    "Source",
+    "StageLog",
+    "Stream",
+    "Transform",
+    "TransformEstimate",
+    "Truth",
+    "Verification",
+    "VerificationView",
+    "VerifiedHandEye",
+    "Views",
+    "Warn",
+    "WeldReport",
+    "WorkpieceScan",
+    "by_frame",
+    "records_of",
+    "warnings_of",
+]
 
 
 @dataclass(frozen=True, eq=False)

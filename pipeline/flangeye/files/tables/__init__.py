@@ -23,20 +23,39 @@ from typing import Any
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.files.documents import DOCUMENT_READERS as DOCUMENT_READERS
-from flangeye.files.documents import document_of as document_of
-from flangeye.files.documents import stacked
+from flangeye.files.documents import DOCUMENT_READERS, document_of, stacked
 from flangeye.files.recording import MIN_CAPTURES
 from flangeye.files.regular import read_any_text
 from flangeye.files.scans import natural, partners
-from flangeye.files.tables.table import CellValue as CellValue
-from flangeye.files.tables.table import Column as Column
-from flangeye.files.tables.table import Rows, TableRow, record_of, rows_of, table_of
-from flangeye.files.tables.table import Table as Table
-from flangeye.files.tables.table import entry_of_list as entry_of_list
-from flangeye.files.tables.table import number_of as number_of
+from flangeye.files.tables.table import (
+    CellValue,
+    Column,
+    Rows,
+    Table,
+    TableRow,
+    entry_of_list,
+    number_of,
+    record_of,
+    rows_of,
+    table_of,
+)
 from flangeye.files.words import reason_of
 from flangeye.types.pose_formats import CONVENTIONS
+
+__all__ = [
+    "DOCUMENT_READERS",
+    "CellValue",
+    "Column",
+    "Table",
+    "document_of",
+    "entry_of_list",
+    "files_at",
+    "number_of",
+    "read_table",
+    "rows_together",
+    "tables_in",
+]
+
 
 _COMMENT = re.compile(r"(?<!\s)\s*(?:[#%!]|//|;(?=[^;]*$))[#%!;/ ]*")
 """Mark at the beginning of a comment line; a semicolon separates cells if the line has more."""
