@@ -51,7 +51,7 @@ from flangeye_plugins.reader.columns import (
 )
 from flangeye_plugins.reader.pairing import MatchedPose, PairingParams, pair
 
-Stream = tuple[Floats, Floats]
+ArmStream = tuple[Floats, Floats]
 """Times and poses of an arm."""
 
 BY_JOINTS = "joints"
@@ -349,18 +349,20 @@ def _with_joints(
     ]
 
 
-def _motion(arm: tuple[Floats, Floats], second: Stream | None, found: MatchedPose) -> Motion | None:
+def _motion(
+    arm: tuple[Floats, Floats], second: ArmStream | None, found: MatchedPose
+) -> Motion | None:
     """Return the arms' motion; None at rest."""
     if found.motion is None or second is None:
         return found.motion
     return passed(*arm, found.time, {FLANGE2: second})
 
 
-def _second_at(second: Stream | None, found: MatchedPose) -> Floats | None:
+def _second_at(second: ArmStream | None, found: MatchedPose) -> Floats | None:
     return None if second is None else interpolated(*second, np.array([found.time]))[0]
 
 
-def _stream_of(readings: Readings) -> Stream | None:
+def _stream_of(readings: Readings) -> ArmStream | None:
     """Return times and poses; None without times."""
     if readings.times is None:
         return None
