@@ -23,9 +23,9 @@ SPREAD = np.diag([4e-6, 1e-6, 9e-6, 1e-8, 4e-8, 9e-8])
 COUNT = 16
 
 
-def session(kind: str = "marker") -> tuple[Problem, Places]:
+def session(kind: str = "marker", count: int = COUNT) -> tuple[Problem, Places]:
     """Return a session's problem, its noise fixed to the targets, and the true places."""
-    made = foreign.session(kind, foreign.UR5E, 1e-3, COUNT, 1)
+    made = foreign.session(kind, foreign.UR5E, 1e-3, count, 1)
     problem = problem_of(made, kind, made.reported, made.joints, made.seen)
     both = np.kron(np.eye(2), problem.seen.rotations)
     covariances: Floats = np.asarray(both @ SPREAD @ np.swapaxes(both, 1, 2), dtype=np.float64)
@@ -86,12 +86,22 @@ def test_weighted_poses_stand_for_all_poses_of_a_box_better_than_as_many_even_on
 
     def bent(at: Floats) -> Floats:
         tip = at[:, :3, :3] @ [0.1, 0.05, 0.2] + at[:, :3, 3] - middle
-        return np.column_stack([tip, tip**2, tip[:, :1] * tip[:, 1:]])
+        bends = tip[:, :1] * tip[:, 1:]
+        return np.column_stack([tip, tip**2, bends, 10 * tip**3, 10 * tip[:, 2:] * bends])
 
     expected = bent(every).mean(axis=0)
     off = np.abs(weights @ bent(poses) - expected)
     even = np.abs(bent(poses).mean(axis=0) - expected)
     assert np.linalg.norm(off) < 0.1 * np.linalg.norm(even)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_no_few_poses_of_a_small_box_stand_for_all_others(count: int) -> None:
+    problem, places = session(count=count)
+    boxes = work_of(problem, places).boxes
+    assert np.minimum(boxes, 0.0).sum(axis=1).min() > -0.5
+    within = (boxes != 0).sum(axis=1)
+    assert (1 / (boxes**2).sum(axis=1) > within / 8).all()
 
 
 def test_a_box_that_is_stated_is_filled_evenly_with_the_session_s_orientations() -> None:
