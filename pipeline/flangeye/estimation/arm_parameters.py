@@ -121,18 +121,12 @@ def _loosely(found: Estimate, of_size: Indices) -> Floats:
 
 def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
     """Return (n, 4) the column of each parameter among the unknowns, and the index of its size."""
-    first = found.posterior.model.p + np.cumsum([0, *found.counts])
-    kinds = ("zeros", "lengths", "twists")
-    at = {e.kind: k for k, e in enumerate(found.effects) if e.cause == arm and e.kind in kinds}
-    zeros, lengths, twists = (at[kind] for kind in kinds)
-    joint = np.arange(found.counts[zeros])
-    columns = np.column_stack([
-        first[zeros] + joint,
-        first[lengths] + 2 * joint,
-        first[lengths] + 2 * joint + 1,
-        first[twists] + joint,
-    ])  # fmt: skip
-    return columns, np.tile([zeros, lengths, lengths, twists], (len(joint), 1))
+    zeros, lengths, twists = (
+        next(np.arange(at.start, at.stop) for e, at in found.rows(kind) if e.cause == arm)
+        for kind in ("zeros", "lengths", "twists")
+    )
+    columns = np.column_stack([zeros, lengths.reshape(-1, 2), twists])
+    return columns, found.posterior.model.sizes.effect[columns - found.posterior.model.p]
 
 
 def most_informative_poses(

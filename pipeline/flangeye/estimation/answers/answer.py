@@ -117,7 +117,7 @@ class _Commands:
         world, out = self._world, [np.zeros((len(self.boxes), 0, self._of_arm.shape[2]))]
         for name in self.found.problem.unknown:
             carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
-            # A camera in hand is to see all that is up to 50 mm about the target where it is
+            # Not only the target but what is seen within 50 mm of it is to be in its right place
             about = 0.05 if carried else 0.0
             out.append(self._carried(name, world, about) if carried else self._fixed(name, world))
             # Its lasting errors move what it reports at the work as they did in the session
@@ -165,11 +165,11 @@ class _Commands:
     def _explained(self, by: Floats, moved: Floats, about: float = 0.0) -> Floats:
         """Return (B, 6, K): twists ``moved`` (W, 6, K), fitted over each box by least squares.
 
-        Turns count like what they do to a cube of 2 ``about`` [m].
+        A turn counts by how far it moves the points of a cube, rms; ``about`` is half its edge [m].
         """
-        # And like what they do 2 mm away: enough to determine the turn about a line where the work
-        # is in one, and no more, for the work is at positions. At 20 mm an arm of 3 mrad turned the
-        # answer by 0.15 mrad, as much as 60 poses leave uncertain
+        # Two millimetres determine the turn about a line where the work is in one, and no more, for
+        # the work is at positions. At 20 mm an arm of 3 mrad turned the answer by 0.15 mrad, as
+        # much as 60 poses leave uncertain
         lever = np.hypot(0.002, about * np.sqrt(2 / 3))
         weight = np.repeat([lever, 1.0], 3)[:, None]
         across = np.swapaxes(weight**2 * by, 1, 2)

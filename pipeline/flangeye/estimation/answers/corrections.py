@@ -46,11 +46,9 @@ def _flanges(found: Estimate) -> list[Carrier]:
 
 def _rows(found: Estimate, carrier: Carrier, kind: str) -> slice | None:
     """Return the slice of an arm's parameters of one kind; None if it has none."""
-    ends = np.cumsum([0, *found.counts])
-    for k, effect in enumerate(found.effects):
-        if effect.kind == kind and effect.cause == carrier.arm:
-            return slice(int(ends[k]), int(ends[k + 1]))
-    return None
+    p = found.posterior.model.p
+    own = (at for effect, at in found.rows(kind) if effect.cause == carrier.arm)
+    return next((slice(at.start - p, at.stop - p) for at in own), None)
 
 
 def _correction(
