@@ -37,7 +37,7 @@ def flangeye_stages() -> Mapping[str, str]:
             "segment.body: segment_body",
             "fit.body: fit_body",
             "solve.robust: solve_robust",
-            "solve.named: solve_svd",
+            "solve.svd: solve_svd",
             "solve.iterative: solve_iterative",
         ),
         **_all_of("solve.named:CLOSED_FORMS", "solve", closed_forms),

@@ -24,8 +24,8 @@ from flangeye.workflow.recipe.load import Recipe, load_recipe
 from flangeye_plugins.fit.ransac import fit_ransac_circle
 from flangeye_plugins.fit.rim import fit_rim
 from flangeye_plugins.segment.flange import segment_flange
-from flangeye_plugins.solve.named import solve_svd
 from flangeye_plugins.solve.robust import RobustParams, solve_robust
+from flangeye_plugins.solve.svd import solve_svd
 
 
 class Work(NamedTuple):

@@ -37,7 +37,7 @@ from flangeye.workflow.recipe.load import parse_recipe
 from flangeye.workflow.run.folder import RunFolder
 from flangeye.workflow.run.restart import restart_at
 from flangeye.workflow.run.session import Start, record_run
-from flangeye_plugins.solve.named import solve_svd
+from flangeye_plugins.solve.svd import solve_svd
 from tests import toy
 
 

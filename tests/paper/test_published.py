@@ -26,7 +26,7 @@ from flangeye_paper.realisations import error_oracle
 from flangeye_plugins.cost import TranslationParams, cost_translation
 from flangeye_plugins.reader.ancorasir import AncorasirParams
 from flangeye_plugins.reader.ancorasir import ancorasir as reader
-from flangeye_plugins.solve.named import SvdParams, solve_svd
+from flangeye_plugins.solve.svd import SvdParams, solve_svd
 
 ICP, STORED = "verify.icp_as_in_paper", "verify.stored_results_as_in_paper"
 

@@ -58,8 +58,8 @@ from flangeye_plugins.scanner.watched_folder import (
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
 from flangeye_plugins.segment.sphere import segment_sphere
 from flangeye_plugins.solve.iterative import solve_iterative
-from flangeye_plugins.solve.named import solve_svd
 from flangeye_plugins.solve.robust import solve_robust
+from flangeye_plugins.solve.svd import solve_svd
 from flangeye_plugins.verify.holdout import verify_holdout
 from flangeye_plugins.verify.icp import verify_icp
 from flangeye_plugins.view import GuessParams, view_guess

@@ -14,13 +14,10 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
 from flangeye.estimation.graph import Places, Problem
-from flangeye.maths.statistics import chi2_quantile
 from flangeye.models.cell import chain
 from flangeye.types import CAMERA, TARGET, Floats
-from flangeye.types.geometry import invert, kabsch, levers, rotation_exp, rotation_log, stack_rows
+from flangeye.types.geometry import invert, rotation_exp, rotation_log, stack_rows
 
-FINEST_NOISE = 1e-5
-"""Smallest noise of scanner and arm together [m], so that exact inputs do not seem observable."""
 NO_MOTION = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
 
@@ -130,142 +127,9 @@ def spread_of(points: Floats) -> Spread:
     )
 
 
-def require_poses(count: int, needed: int = 3) -> None:
-    """Refuse fewer than ``needed`` poses.
-
-    Raises:
-        StageError: There are fewer.
-    """
-    if count < needed:
-        raise StageError(
-            f"{needed} poses needed, {count} given: add poses, or see why captures were set aside"
-        )
-
-
-def require_several_places(tcps: Floats) -> None:
-    """Refuse (N, 3) TCPs [m] that are all the same to within 1 mm.
-
-    Raises:
-        StageError: All are at one place, which the message gives.
-    """
-    radius = spread_of(tcps).radius
-    if radius < 1e-3:
-        raise StageError(
-            f"all {len(tcps)} poses are at one place, {in_base(tcps.mean(axis=0))} m "
-            f"within {radius * 1e3:.1f} mm: move the arm between captures"
-        )
-
-
-def require_same_units(centres: Floats, tcps: Floats) -> None:
-    """Refuse centres (N, 3) whose spread does not match that of the TCPs (N, 3).
-
-    Medians of all pairwise distances are compared: neither the camera's place nor a few wrong
-    centres matter.
-
-    Raises:
-        CalibrationRefused: The ratio of the two medians is not between 0.5 and 2.
-    """
-    # A rigid motion keeps distances; mm taken for m would give a ratio of 1000
-    ratio = _median_distance(centres) / _median_distance(tcps)
-    if not 0.5 < ratio < 2.0:
-        raise CalibrationRefused(
-            f"the circle centres are {ratio:.4g} times as far apart as the robot's poses",
-            "check that both are in metres, and that each scan belongs to its robot pose",
-        )
-
-
-def require_right_handed(centres: Floats, tcps: Floats) -> None:
-    """Refuse centres (N, 3) that fit the TCPs (N, 3) only when mirrored.
-
-    Raises:
-        CalibrationRefused: The mirrored fit is far better; the message gives both residuals.
-    """
-    straight = _fit_rms(centres, tcps)
-    mirrored = _fit_rms(centres * [1.0, 1.0, -1.0], tcps)
-    # Centres near one plane fit their mirror image as well: a good direct fit is never refused
-    if straight > 1e-3 and mirrored < 0.1 * straight:
-        raise CalibrationRefused(
-            f"the centres fit the poses only when mirrored ({mirrored * 1e3:.1f} mm rms instead "
-            f"of {straight * 1e3:.1f} mm)",
-            "flip one axis of the scanner's or the robot's frame",
-        )
-
-
-def require_observable(
-    tcps: Floats, axes: Floats, information: Floats, noise: float, limit: float
-) -> None:
-    """Refuse poses that leave rotation about some axis unknown.
-
-    Args:
-        tcps: (N, 3) flange centres in ``base`` [m].
-        axes: (M, 3) flange axes in ``base``, of the poses whose normal was measured.
-        information: (6 + k, 6 + k) Fisher information: rotation, translation, nuisances.
-        noise: Standard deviation of each coordinate of a centre [m].
-        limit: Largest standard deviation of rotation about any axis [rad].
-
-    Raises:
-        CalibrationRefused: Names the axis and the motion that is missing.
-    """
-    # Of the rotation alone, with translation and nuisances marginalised (Schur complement)
-    rest = np.linalg.pinv(information[3:, 3:], hermitian=True)
-    of_rotation = information[:3, :3] - information[:3, 3:] @ rest @ information[3:, :3]
-    weak = weak_moves(of_rotation, np.full(3, limit))
-    if not weak:
-        return
-    spread = spread_of(tcps)
-    if spread.width < 0.1 * spread.length:
-        parallel = " and the flange's axis is nearly parallel to it" if len(axes) else ""
-        raise CalibrationRefused(
-            f"the {len(tcps)} flange centres lie on a line along base {in_base(spread.axis, 2)} "
-            f"within {spread.farthest * 1e3:.1f} mm{parallel}: rotation about that line is not "
-            "observable",
-            "move the arm across it",
-        )
-    axis = weak.moves[:, 0] / limit
-    cure = (
-        "spread the poses further, and check that each scan belongs to its robot pose"
-        # Noise of a centre beyond which something is not as the recipe states [m]
-        if noise < 5e-3
-        else "no scanner or arm is so noisy: check that each scan belongs to its robot pose, and "
-        "that the target is where the recipe has it (configuration: {place: unknown} finds it)"
-    )
-    raise CalibrationRefused(
-        f"rotation about base {in_base(axis, 2)} is known to "
-        f"{np.degrees(weak.excess[0] * limit):.1f} deg only "
-        f"(limit {np.degrees(limit):g} deg) with {noise * 1e3:.1f} mm of noise per axis",
-        cure,
-    )
-
-
-def information_of_centres(tcps: Floats, noise: float) -> Floats:
-    """Return the (6, 6) Fisher information of (N, 3) centres with equal isotropic noise [m]."""
-    jacobian = levers(tcps - tcps.mean(axis=0))
-    return np.asarray(np.einsum("nai,naj->ij", jacobian, jacobian) / noise**2)
-
-
-def robust_sigma(residuals: Floats) -> float:
-    """Return the noise of one coordinate [m] by the median of (N, 3) residuals of a rigid fit."""
-    n = len(residuals)
-    median = float(np.median(np.linalg.norm(residuals, axis=1)))
-    # A rigid fit takes six degrees of freedom off 3 n coordinates
-    unbiased = np.sqrt(3 * n / max(3 * n - 6, 1))
-    return float(unbiased * median / np.sqrt(chi2_quantile(0.5, 3)))
-
-
 def in_base(vector: Floats, digits: int = 3) -> str:
     """Return a direction as text, ``(0.020, 0.990, 0.010)``, without negative zeros."""
     return "(" + ", ".join(f"{v:.{digits}f}" for v in np.round(vector, digits) + 0.0) + ")"
-
-
-def _median_distance(points: Floats) -> float:
-    first, second = np.triu_indices(len(points), k=1)
-    return float(np.median(np.linalg.norm(points[first] - points[second], axis=1)))
-
-
-def _fit_rms(source: Floats, target: Floats) -> float:
-    rotation, translation = kabsch(source, target)
-    errors = source @ rotation.T + translation - target
-    return float(np.sqrt((errors**2).sum(axis=1).mean()))
 
 
 def require_enough(problem: Problem, needed: int) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from flangeye import BoundPart, CalibrationRefused, Choose, Params, stage
-from flangeye.estimation.observability import FINEST_NOISE, require_poses, robust_sigma, spread_of
+from flangeye.estimation.observability import spread_of
 from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.targets import Flange
 from flangeye.types import (
@@ -23,12 +23,14 @@ from flangeye.types import (
     TransformEstimate,
     Views,
 )
-from flangeye.types.geometry import kabsch, kabsch_covariance, rigid
+from flangeye.types.geometry import kabsch, rigid
 from flangeye.units import Length, param
 from flangeye_plugins.solve.observations import (
     centres_of,
     estimate_of,
     hand_eye,
+    noise_of,
+    require_poses,
     residuals_of,
     tcps_of,
 )
@@ -192,10 +194,8 @@ def _with_covariance(
     # taken from all poses seen, by a median, which a few bad ones do not move
     residuals = residuals_of(seen, answer.rotation, answer.translation)
     inflation = covariance_inflation(max(3 * len(seen) - 6, 3))
-    sigma = max(robust_sigma(residuals), FINEST_NOISE) * float(np.sqrt(inflation))
-    tcps = tcps_of(pool)
-    covariance = kabsch_covariance(tcps, sigma)
-    return estimate_of(answer.rotation, answer.translation, covariance, tcps.mean(axis=0))
+    sigma = noise_of(residuals) * float(np.sqrt(inflation))
+    return estimate_of(answer.rotation, answer.translation, tcps_of(pool), sigma)
 
 
 def _mm(metres: float) -> str:

@@ -18,37 +18,17 @@ from flangeye.estimation.closed.motions import (
     tsai_lenz,
 )
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.observability import (
-    FINEST_NOISE,
-    fewest_sightings,
-    information_of_centres,
-    require_enough,
-    require_observable,
-    require_poses,
-    require_right_handed,
-    require_same_units,
-    require_several_places,
-    require_turns,
-    robust_sigma,
-)
+from flangeye.estimation.observability import fewest_sightings, require_enough, require_turns
 from flangeye.estimation.start.loops import loop_of, start_of_circles
 from flangeye.estimation.start.sightings import problem_of
-from flangeye.maths.statistics import covariance_inflation
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
 from flangeye.models.robots import RobotModel, SecondRobot
 from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
-from flangeye.types import Floats, HandEye, Observation, Observations, TransformEstimate
-from flangeye.types.geometry import invert, kabsch, kabsch_covariance
-from flangeye_plugins.solve.observations import (
-    LimitsParams,
-    centres_of,
-    estimate_of,
-    hand_eye,
-    residuals_of,
-    tcps_of,
-)
+from flangeye.types import Floats, HandEye, Observation, Observations
+from flangeye.types.geometry import invert
+from flangeye_plugins.solve.observations import LimitsParams
 
 ClosedForm = Callable[[Problem], Places]
 """Gives (4, 4) of each unknown."""
@@ -248,72 +228,3 @@ CLOSED_FORMS = (
     ),
 )
 """The stages."""
-
-
-class SvdParams(LimitsParams):
-    """Parameters of ``solve.svd``."""
-
-
-@stage("solve.svd")
-def solve_svd(observations: Observations, params: SvdParams) -> HandEye:
-    """Fit the camera's pose to all centres by equally weighted least squares.
-
-    Equations (8) to (10) of the paper with scale one. The noise is assumed equal in every
-    coordinate of every centre and estimated from the residuals. For few poses the covariance is
-    inflated so that its 95 % region has the right coverage (see ``covariance_inflation``).
-
-    Raises:
-        StageError: There are fewer than three poses, or all are at one position.
-        CalibrationRefused: The centres are in another unit or mirrored, are collinear, or do not
-            determine a rotation.
-    """
-    pulled = list(observations)
-    check_poses(pulled)
-    rotation, translation = kabsch(centres_of(pulled), tcps_of(pulled))
-    # A flange's centre is its origin, so the TCPs are the target points.
-    residuals = residuals_of(pulled, rotation, translation)
-    _require_observable(tcps_of(pulled), residuals, params.rotation_limit)
-    estimate = least_squares_estimate(rotation, translation, tcps_of(pulled), residuals)
-    return hand_eye(pulled, estimate, "solve.svd")
-
-
-def check_poses(observations: Sequence[Observation]) -> None:
-    """Refuse observations from which no method can determine the pose.
-
-    Raises:
-        StageError: There are too few, or all are at one position.
-        CalibrationRefused: Units differ, or the centres fit only when mirrored.
-    """
-    require_poses(len(observations))
-    centres, tcps = centres_of(observations), tcps_of(observations)
-    # In this order: at one place the ratio of distances means nothing, and in another unit no
-    # mirror fits either
-    require_several_places(tcps)
-    require_same_units(centres, tcps)
-    require_right_handed(centres, tcps)
-
-
-def _require_observable(tcps: Floats, residuals: Floats, limit: float) -> None:
-    # A floor, for residuals of three poses or of exact data would make any motion observable
-    noise = max(robust_sigma(residuals), FINEST_NOISE)
-    no_axes = np.zeros((0, 3))
-    require_observable(tcps, no_axes, information_of_centres(tcps, noise), noise, limit)
-
-
-def least_squares_estimate(
-    rotation: Floats, translation: Floats, tcps: Floats, residuals: Floats
-) -> TransformEstimate:
-    """Return a least-squares pose with the covariance estimated from its residuals.
-
-    Args:
-        rotation: (3, 3) ``base_R_camera``.
-        translation: (3,) translation [m].
-        tcps: (N, 3) flange centres in ``base`` [m].
-        residuals: (N, 3) residuals of N >= 3 pairs [m].
-    """
-    # A rigid fit takes six; the 95 % region of a variance that is estimated from the rest is wider
-    # than the chi-square's by F's quantile
-    freedom = 3 * len(tcps) - 6
-    sigma = float(np.sqrt((residuals**2).sum() / freedom * covariance_inflation(freedom)))
-    covariance = kabsch_covariance(tcps, sigma)
-    return estimate_of(rotation, translation, covariance, tcps.mean(axis=0))

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from flangeye.errors import StageError
+from flangeye.maths.statistics import chi2_quantile
 from flangeye.plugin.stage import Params
 from flangeye.types import (
     BASE,
@@ -15,7 +17,7 @@ from flangeye.types import (
     Transform,
     TransformEstimate,
 )
-from flangeye.types.geometry import rigid
+from flangeye.types.geometry import kabsch_covariance, rigid
 from flangeye.units import Angle, param
 
 
@@ -46,13 +48,43 @@ def residuals_of(observations: Sequence[Observation], rotation: Floats, shift: F
     return np.asarray(centres_of(observations) @ rotation.T + shift - tcps_of(observations))
 
 
+def require_poses(count: int, needed: int = 3) -> None:
+    """Refuse fewer than ``needed`` poses.
+
+    Raises:
+        StageError: There are fewer.
+    """
+    if count < needed:
+        raise StageError(
+            f"{needed} poses needed, {count} given: add poses, or see why captures were set aside"
+        )
+
+
+def noise_of(residuals: Floats) -> float:
+    """Return the noise of one coordinate [m] by the median of (N, 3) residuals of a rigid fit."""
+    n = len(residuals)
+    median = float(np.median(np.linalg.norm(residuals, axis=1)))
+    # A rigid fit takes six degrees of freedom off 3 n coordinates
+    unbiased = np.sqrt(3 * n / max(3 * n - 6, 1))
+    # No scanner and arm are better [m]: three poses or exact data would make any motion observable
+    return max(float(unbiased * median / np.sqrt(chi2_quantile(0.5, 3))), 1e-5)
+
+
 def estimate_of(
-    rotation: Floats, translation: Floats, covariance: Floats, about: Floats
+    rotation: Floats, translation: Floats, tcps: Floats, sigma: float
 ) -> TransformEstimate:
-    """Return ``base_T_camera`` with its (6, 6) covariance about a point in ``base``."""
-    # Symmetric to the last bit: a product of matrices rounds each half on its own
+    """Return ``base_T_camera`` of a rigid fit, with its covariance.
+
+    Args:
+        rotation: (3, 3) ``base_R_camera``.
+        translation: (3,) translation [m].
+        tcps: (N, 3) flange centres in ``base`` [m].
+        sigma: Standard deviation of each coordinate of a centre [m].
+    """
+    covariance = kabsch_covariance(tcps, sigma)
     transform = Transform(BASE, CAMERA, rigid(rotation, translation))
-    return TransformEstimate(transform, 0.5 * (covariance + covariance.T), about)
+    # Symmetric to the last bit: a product of matrices rounds each half on its own
+    return TransformEstimate(transform, 0.5 * (covariance + covariance.T), tcps.mean(axis=0))
 
 
 def hand_eye(

@@ -39,8 +39,8 @@ from flangeye_plugins.fit.rim import RimParams, fit_rim
 from flangeye_plugins.reader.ancorasir import AncorasirParams
 from flangeye_plugins.reader.ancorasir import ancorasir as published_layout
 from flangeye_plugins.segment.flange import SegmentParams, segment_flange
-from flangeye_plugins.solve.named import SvdParams, solve_svd
 from flangeye_plugins.solve.robust import RobustParams, solve_cell
+from flangeye_plugins.solve.svd import SvdParams, solve_svd
 from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout
 
 MM = 1e-3

@@ -33,8 +33,8 @@ from flangeye.types.geometry import (
     rigid,
     rotation_exp,
 )
-from flangeye_plugins.solve.named import SvdParams, solve_svd
 from flangeye_plugins.solve.robust import RobustParams, solve_cell, solve_robust
+from flangeye_plugins.solve.svd import SvdParams, solve_svd
 from flangeye_plugins.verify.holdout import HoldoutParams, verify_holdout
 
 MM, DEG = 1e-3, np.pi / 180

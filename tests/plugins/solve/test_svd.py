@@ -1,5 +1,6 @@
 """solve.svd: exact recovery, equivariance, calibrated covariance, refusals, published result."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,22 @@ from flangeye.types import (
     Transform,
     by_frame,
 )
-from flangeye.types.geometry import covariance_at, rotation_exp
-from flangeye_plugins.solve.named import SvdParams, solve_svd
+from flangeye.types.geometry import covariance_at, kabsch, kabsch_covariance, rotation_exp
+from flangeye_plugins.solve.observations import noise_of, require_poses
+from flangeye_plugins.solve.svd import (
+    SvdParams,
+    _fit_rms,
+    _median_distance,
+    require_right_handed,
+    require_rotation,
+    require_same_units,
+    require_several_places,
+    solve_svd,
+)
 
 TRUTH = rotation_exp(np.array([2.9, 0.4, -0.3])), np.array([0.4, -0.7, 0.9])
 MM = 1e-3
+RNG = np.random.default_rng(0)
 
 
 def observe(centres: np.ndarray, tcps: np.ndarray) -> Observations:
@@ -220,3 +232,141 @@ def test_published_centres_give_the_published_matrix(ancorasir: Path) -> None:
     tcps = np.load(folder / "p_robot_mat.npy").T
     found = solve(centres, tcps).base_T_camera.transform
     np.testing.assert_allclose(found.matrix, np.load(folder / "H.npy"), atol=1e-6)
+
+
+def test_centres_that_fit_in_a_mirror_only_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    tcps = rng.uniform(-0.2, 0.2, (8, 3))
+    centres = (tcps - [0.6, 0.0, 1.0]) @ rotation_exp(np.array([2.0, 0.3, -0.4]))
+    noise = 1e-4 * rng.standard_normal((8, 3))
+    require_right_handed(centres + noise, tcps)
+    require_right_handed(centres + 100 * noise, tcps)  # noise alone is not a mirror
+    for axis in range(3):
+        mirrored = (centres + noise) * np.where(np.arange(3) == axis, -1.0, 1.0)
+        with pytest.raises(CalibrationRefused, match=r"only when mirrored \(0.1 mm rms instead of"):
+            require_right_handed(mirrored, tcps)
+
+
+@pytest.mark.parametrize(
+    ("rises", "noise", "refused"),
+    [(0.1, 0.018, True), (0.1, 0.0184, False), (5.2e-4, 1e-5, True), (4.8e-4, 1e-5, False)],
+)
+def test_a_mirror_is_named_that_leaves_a_tenth_of_more_than_a_millimetre(
+    rises: float, noise: float, refused: bool
+) -> None:
+    """A saddle: no turn takes it to its mirror, so it is off by twice its height, less noise."""
+    low = np.array([[0.3, 0.3, 0], [-0.3, 0.3, 0], [-0.3, -0.3, 0], [0.3, -0.3, 0]])
+    heights = np.array([1.0, -1.0, 1.0, -1.0])
+    saddle = low + np.outer(heights, [0.0, 0.0, rises])
+    bend = np.outer(heights, [0.0, 0.0, noise])
+    centres = saddle * [1.0, 1.0, -1.0] + bend
+    if not refused:
+        require_right_handed(centres, saddle)
+        return
+    with pytest.raises(
+        CalibrationRefused, match=f"mirrored \\({noise * 1e3:.1f} mm rms instead of "
+    ):
+        require_right_handed(centres, saddle)
+
+
+def test_the_noise_that_residuals_show_is_the_noise_of_one_coordinate() -> None:
+    rng, sigma, count = np.random.default_rng(1), 1e-3, 6
+    found = []
+    for _ in range(600):
+        centres = rng.uniform(-0.2, 0.2, (count, 3))
+        tcps = centres + sigma * rng.standard_normal((count, 3))
+        rotation, shift = kabsch(centres, tcps)
+        found.append(noise_of(tcps - centres @ rotation.T - shift))
+    assert np.mean(found) == pytest.approx(sigma, rel=0.06)
+
+
+def test_three_poses_are_needed_and_more_than_one_place() -> None:
+    require_poses(3)
+    with pytest.raises(StageError, match="4 poses needed, 3 given: "):
+        require_poses(3, needed=4)
+    with pytest.raises(StageError, match="3 poses needed, 2 given: "):
+        require_poses(2)
+    around = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    require_several_places(1.01e-3 * around + [0.4, -0.2, 0.3])
+    said = r"all 4 poses are at one place, \(0.400, -0.200, 0.300\) m within 0.9 mm: move the arm"
+    with pytest.raises(StageError, match=said):
+        require_several_places(0.9e-3 * around + [0.4, -0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("ratio", "taken"), [(0.51, True), (1.99, True), (0.49, False), (2.01, False)]
+)
+def test_centres_are_about_as_far_apart_as_the_poses(ratio: float, taken: bool) -> None:
+    tcps = RNG.uniform(-0.2, 0.2, (9, 3))
+    if taken:
+        require_same_units(ratio * tcps + 5.0, tcps)
+        return
+    with pytest.raises(
+        CalibrationRefused, match=f"the circle centres are {ratio:.4g} times as far apart"
+    ):
+        require_same_units(ratio * tcps + 5.0, tcps)
+
+
+def test_of_distances_the_middle_one_counts() -> None:
+    line = np.outer([0.0, 1.0, 3.0, 30.0], [0.0, 0.6, 0.8])
+    assert _median_distance(line) == pytest.approx(np.median([1, 2, 3, 27, 29, 30]))
+
+
+def test_centres_inform_of_shifts_by_their_number_and_of_turns_by_their_levers() -> None:
+    points = RNG.uniform(-0.3, 0.3, (7, 3)) + 2.0
+    found = np.linalg.inv(kabsch_covariance(points, 1e-3))
+    levers = points - points.mean(axis=0)
+    inertia = (levers**2).sum() * np.eye(3) - levers.T @ levers
+    expected = 1e6 * np.block([[inertia, np.zeros((3, 3))], [np.zeros((3, 3)), 7 * np.eye(3)]])
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_rotation_that_stays_unknown_is_named_with_what_would_show_it() -> None:
+    line = np.outer(np.linspace(-0.2, 0.2, 7), [0.0, 0.6, 0.8])
+    aside = np.outer([1, -1, 1, 0, 1, -1, 1], [1e-3, 0.0, 0.0])
+    with pytest.raises(CalibrationRefused) as on_a_line:
+        require_rotation(line + aside, 1e-3, np.radians(1))
+    assert str(on_a_line.value) == (
+        "the 7 flange centres lie on a line along base (0.00, 0.60, 0.80) within 1.3 mm: rotation "
+        "about that line is not observable; move the arm across it"
+    )
+    require_rotation(line + 100 * aside, 1e-3, np.radians(1))
+    # 0.2 m of lever about z alone, and noise that it does not outweigh.
+    flat = 0.1 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    sigma = 4e-3 / np.sqrt(2 * 0.1**2)  # about x and about y; about z by root 2 better
+    require_rotation(flat, 4e-3, 1.01 * sigma)
+    for noise, cure in ((4e-3, "spread the poses further, and check"), (6e-3, "no scanner or arm")):
+        with pytest.raises(CalibrationRefused) as weak:
+            require_rotation(flat, noise, 0.5 * sigma)
+        told = f"{np.degrees(sigma * noise / 4e-3):.1f} deg only"
+        assert told in str(weak.value) and f"{noise * 1e3:.1f} mm of noise per axis; {cure}" in str(
+            weak.value
+        )
+
+
+def test_what_a_shift_would_explain_tells_nothing_of_a_rotation() -> None:
+    """Turns about a point far away shift the centres as well: neither is known by it better."""
+    flat = 0.1 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
+    limit = 4e-3 / np.sqrt(2 * 0.1**2)
+    away = flat + [3.0, -2.0, 1.0]
+    require_rotation(away, 4e-3, 1.01 * limit)
+    with pytest.raises(CalibrationRefused, match="is known to"):
+        require_rotation(away, 4e-3, 0.99 * limit)
+
+
+def test_of_two_rotations_that_are_weak_the_weaker_is_named() -> None:
+    """Levers of 100 mm about y and of 50 mm about x, of both about z."""
+    flat = np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.05, 0], [0, -0.05, 0]])
+    with pytest.raises(CalibrationRefused) as weak:
+        require_rotation(flat, 4e-3, 1e-3)
+    named = re.match(r"rotation about base \((.*?)\) is known to ([\d.]+) deg", str(weak.value))
+    assert named is not None
+    axis = [float(x) for x in named[1].split(",")]
+    assert np.abs(axis).tolist() == [1.0, 0.0, 0.0]
+    assert float(named[2]) == pytest.approx(np.degrees(4e-3 / np.sqrt(2 * 0.05**2)), abs=0.05)
+
+
+def test_a_fit_leaves_the_root_of_the_mean_square_distance() -> None:
+    corners = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+    bent = corners + np.outer([0.3, -0.3, -0.3, 0.3], [0.0, 0.0, 1.0])
+    assert _fit_rms(corners + 3.0, bent) == pytest.approx(0.3)

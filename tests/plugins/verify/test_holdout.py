@@ -23,7 +23,7 @@ from flangeye.types import (
     by_frame,
 )
 from flangeye.types.geometry import rigid, rotation_exp
-from flangeye_plugins.solve.named import SvdParams, solve_svd
+from flangeye_plugins.solve.svd import SvdParams, solve_svd
 from flangeye_plugins.verify.holdout import (
     HoldoutParams,
     deal,
