@@ -18,11 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from flangeye.estimation.closed import at_once, motions
-from flangeye.estimation.closed.comanipulation import alternate, random_rotations
+from flangeye.estimation.start.closed import (
+    alternate,
+    motions_of,
+    park_martin,
+    random_rotations,
+    shah,
+)
 from flangeye.estimation.start.sightings import problem_of
 from flangeye.models.cell import cell_of
 from flangeye.types.geometry import rotation_log
+from flangeye_plugins.solve import literature
 from flangeye_plugins.solve.robust import (
     RobustParams,
     solve_robust,
@@ -32,13 +38,13 @@ from tests.estimation.cells import CONFIGURATIONS, session
 MARKER = CONFIGURATIONS["eye-in-hand, marker"]
 CASES = {"n=15, 17 deg": (15, np.radians(17)), "n=8, 30 deg": (8, np.radians(30))}
 BY_MOTIONS = {
-    "tsai_lenz": motions.tsai_lenz,
-    "park_martin": motions.park_martin,
-    "horaud_dornaika": motions.horaud_dornaika,
-    "andreff": motions.andreff,
-    "daniilidis": at_once.daniilidis,
+    "tsai_lenz": literature.tsai_lenz,
+    "park_martin": park_martin,
+    "horaud_dornaika": literature.horaud_dornaika,
+    "andreff": literature.andreff,
+    "daniilidis": literature.daniilidis,
 }
-BY_BOTH = {"shah": at_once.shah, "li": at_once.li}
+BY_BOTH = {"shah": shah, "li": literature.li}
 
 
 def sessions(case: str, count: int) -> list:
@@ -59,7 +65,7 @@ def closed(name: str, made) -> np.ndarray:
     carried, seen = arrays(made)
     if name in BY_BOTH:
         return BY_BOTH[name](carried, seen)[0]
-    return BY_MOTIONS[name](motions.motions_of(carried, seen))
+    return BY_MOTIONS[name](motions_of(carried, seen))
 
 
 def most_likely(made) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.estimation.closed.at_once import shah
+from flangeye.estimation.start.closed import shah
 from flangeye.models.bodies import TargetBody, carrying
 from flangeye.models.robots import RobotModel
 from flangeye.models.scanners import ScannerModel

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flangeye.estimation.closed.comanipulation import alternate
+from flangeye.estimation.start.closed import alternate
 from flangeye.estimation.start.loops import entries, least_squares
 from flangeye.types import Floats, Mask
 from flangeye.types.geometry import each_applied, invert, nearest_rotation

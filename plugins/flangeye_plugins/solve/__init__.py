@@ -1,1 +1,1 @@
-"""``solve.*`` stages: solvers; their mathematics is in ``flangeye.estimation``."""
+"""``solve.*`` stages: solvers; the estimator itself is ``flangeye.estimation``."""

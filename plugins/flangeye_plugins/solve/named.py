@@ -6,19 +6,9 @@ import numpy as np
 
 from flangeye import CalibrationRefused, StageError, stage
 from flangeye.estimation.calibrate import Options, calibrate_at
-from flangeye.estimation.closed.at_once import daniilidis, li, shah
-from flangeye.estimation.closed.comanipulation import FEWEST_KRONECKER, kronecker, two_steps
-from flangeye.estimation.closed.motions import (
-    Motions,
-    andreff,
-    horaud_dornaika,
-    motions_of,
-    park_martin,
-    place_of,
-    tsai_lenz,
-)
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.observability import fewest_sightings, require_enough, require_turns
+from flangeye.estimation.start.closed import Motions, motions_of, park_martin, place_of, shah
 from flangeye.estimation.start.loops import loop_of, start_of_circles
 from flangeye.estimation.start.sightings import problem_of
 from flangeye.models.cell import Cell, cell_of
@@ -28,6 +18,16 @@ from flangeye.models.scanners import ScannerModel
 from flangeye.plugin.stage import Stage
 from flangeye.types import Floats, HandEye, Observation, Observations
 from flangeye.types.geometry import invert
+from flangeye_plugins.solve.literature import (
+    FEWEST_KRONECKER,
+    andreff,
+    daniilidis,
+    horaud_dornaika,
+    kronecker,
+    li,
+    tsai_lenz,
+    two_steps,
+)
 from flangeye_plugins.solve.observations import LimitsParams
 
 ClosedForm = Callable[[Problem], Places]

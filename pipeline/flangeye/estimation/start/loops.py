@@ -18,9 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.estimation.closed.comanipulation import best_rotations, with_translations
-from flangeye.estimation.closed.motions import motions_of, park_martin, place_of
 from flangeye.estimation.graph import Places, Problem, Sightings
+from flangeye.estimation.start.closed import (
+    best_rotations,
+    motions_of,
+    park_martin,
+    place_of,
+    with_translations,
+)
 from flangeye.models.cell import chain
 from flangeye.types import Floats, Indices, Mask
 from flangeye.types.geometry import (

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from flangeye.errors import CalibrationRefused
-from flangeye.estimation.closed.motions import motions_of, park_martin, place_of, translation_of
+from flangeye.estimation.start.closed import motions_of, park_martin, place_of, translation_of
 from flangeye.files.tables import Column, Table, number_of
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.pose_corrections import inverted

@@ -1,17 +1,21 @@
-"""AXB = YCZ, two arms: Kronecker products, alternation, and the paper's decomposition (6).
+"""Closed forms from which an estimate begins: AX = XB, AX = ZB and AXB = YCZ.
 
-``A`` is the first arm's flange in its base, ``B`` the target in the camera, ``C`` the second
-arm's flange in its base; ``X`` the camera in the first flange, ``Y`` the second base in the first,
-``Z`` the target in the second flange.
+With ``G = target_carrier_T_camera_carrier`` reported and ``M = camera_T_target`` measured, ``G X
+M`` is the same at every pose: the target's place Z. This holds for a camera in hand and for a fixed
+one. Two poses i, j therefore give ``A X = X B`` with ``A = inv(G_j) G_i`` and ``B = M_j inv(M_i)``.
+
+Of two arms ``A X B = Y C Z``: ``A`` is the first arm's flange in its base, ``B`` the target in the
+camera, ``C`` the second arm's flange in its base; ``X`` the camera in the first flange, ``Y`` the
+second base in the first, ``Z`` the target in the second flange.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import NDArray
 
 from flangeye.errors import CalibrationRefused
-from flangeye.estimation.closed.motions import motions_of, park_martin, place_of
 from flangeye.types import Floats
 from flangeye.types.geometry import (
     invert,
@@ -19,34 +23,112 @@ from flangeye.types.geometry import (
     rigid,
     rotation_exp,
     rotation_from_quaternion,
+    rotation_log,
     stack_rows,
 )
 
 RotationTriple = tuple[Floats, Floats, Floats]
 
-FEWEST_KRONECKER = 12
-"""Poses from which the 90 products of the rotations' entries follow."""
 
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """K pairs of poses, as motions of the carrier and of the camera.
 
-def kronecker(a: Floats, b: Floats, c: Floats) -> RotationTriple:
-    """Return X, Y, Z (4, 4) by linear least squares, from at least 12 poses each (N, 4, 4).
-
-    ``A X B`` is linear in the 9 entries of X, ``Y C Z`` in the 81 products of those of Y and Z
-    (as in Wang, Wu, Meng & Ren, IROS 2014, there with quaternions). The null vector holds both;
-    the products are then split by their largest singular vectors, and made rotations.
+    Attributes:
+        a: (K, 4, 4) motions of the carrier.
+        b: (K, 4, 4) motions of the camera.
+        alpha: (K, 3) rotation vectors of the first [rad].
+        beta: (K, 3) rotation vectors of the second [rad].
     """
-    rotations = [m[:, :3, :3] for m in (a, b, c)]
-    n, identity = len(a), np.eye(3)
-    of_x = np.einsum("nik,nlj->nijkl", rotations[0], rotations[1]).reshape(n, 9, 9)
-    of_yz = np.einsum("nkl,ia,jb->nijaklb", rotations[2], identity, identity).reshape(n, 9, 81)
-    rows = stack_rows(np.concatenate([of_x, -of_yz], axis=2))
-    null = np.linalg.eigh(rows.T @ rows)[1][:, 0]
-    u, _, vt = np.linalg.svd(null[9:].reshape(9, 9))
-    x, y, z = (
-        nearest_rotation(r * np.sign(np.linalg.det(r)))
-        for r in (null[:9].reshape(3, 3), u[:, 0].reshape(3, 3), vt[0].reshape(3, 3))
-    )
-    return with_translations((a, b, c), (x, y, z))
+
+    a: Floats
+    b: Floats
+    alpha: Floats
+    beta: Floats
+
+
+def motions_of(carried: Floats, seen: Floats) -> Motions:
+    """Return the motions between all pairs of N poses that turn by clearly less than half a turn.
+
+    Args:
+        carried: (N, 4, 4) target_carrier_T_camera_carrier.
+        seen: (N, 4, 4) camera_T_target.
+
+    Raises:
+        CalibrationRefused: There is no such pair.
+    """
+    i, j = np.triu_indices(len(carried), k=1)
+    a = invert(carried[j]) @ carried[i]
+    b = seen[j] @ invert(seen[i])
+    alpha, beta = rotation_log(a[:, :3, :3]), rotation_log(b[:, :3, :3])
+    turns = np.maximum(np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1))
+    # The axis of a rotation by half a turn may point either way: such pairs are left out
+    kept = turns < np.radians(170.0)
+    if not kept.any():
+        raise CalibrationRefused(
+            f"all {len(a)} motions between poses turn by {np.degrees(turns.min()):.0f} deg or "
+            "more: the sign of the axis of a half turn is not determined",
+            "add poses in between",
+        )
+    return Motions(a[kept], b[kept], alpha[kept], beta[kept])
+
+
+def translation_of(rotation: Floats, motions: Motions) -> Floats:
+    """Return the translation (3,) of X [m] that fits its rotation (3, 3) best.
+
+    ``(R_A - 1) t_X = R_X t_B - t_A``, by least squares over all motions.
+    """
+    left = motions.a[:, :3, :3] - np.eye(3)
+    right = motions.b[:, :3, 3] @ rotation.T - motions.a[:, :3, 3]
+    # Of an arm that stood still rounding would make a shift of 1e12 m: a little pull to zero.
+    rows = np.vstack([stack_rows(left), 1e-6 * np.eye(3)])
+    return np.asarray(np.linalg.lstsq(rows, np.append(right.ravel(), np.zeros(3)), rcond=None)[0])
+
+
+def place_of(carried: Floats, x: Floats, seen: Floats) -> Floats:
+    """Return the (4, 4) place Z of the target: the mean of ``G X M`` over the poses."""
+    each = carried @ x @ seen
+    return rigid(nearest_rotation(each[:, :3, :3].mean(axis=0)), each[:, :3, 3].mean(axis=0))
+
+
+def park_martin(motions: Motions) -> Floats:
+    """Return X (4, 4): Park & Martin, IEEE Trans. Robotics and Automation 10(5), 1994.
+
+    The rotation that takes the camera's rotation vectors to the carrier's by least squares, here
+    by the singular value decomposition, which keeps it proper where the axes lie in a plane.
+    """
+    rotation = nearest_rotation(motions.alpha.T @ motions.beta)
+    return rigid(rotation, translation_of(rotation, motions))
+
+
+def shah(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
+    """Return X and Z (4, 4) of ``G X = Z inv(M)``: Shah, J. Mechanisms and Robotics 5(3), 2013.
+
+    Rotations by the singular vectors of the summed Kronecker products, then both translations by
+    linear least squares.
+
+    Args:
+        carried: (N, 4, 4) G, target_carrier_T_camera_carrier.
+        seen: (N, 4, 4) M, camera_T_target.
+    """
+    eyes = invert(seen)
+    products = np.einsum("nji,nlk->ikjl", carried[:, :3, :3], eyes[:, :3, :3])
+    u, _, vt = np.linalg.svd(products.reshape(9, 9))
+    return two_translations(carried, eyes, u[:, 0].reshape(3, 3), vt[0].reshape(3, 3))
+
+
+def two_translations(carried: Floats, eyes: Floats, x: Floats, z: Floats) -> tuple[Floats, Floats]:
+    """Return X and Z from their rotations, known up to a common sign and scale.
+
+    ``R_G t_X - t_Z = R_Z t_N - t_G`` for every pose, N being the camera in the target.
+    """
+    x, z = (nearest_rotation(r * np.sign(np.linalg.det(r))) for r in (x, z))
+    n = len(carried)
+    left = np.zeros((n, 3, 6))
+    left[:, :, :3], left[:, :, 3:] = carried[:, :3, :3], -np.eye(3)
+    right = eyes[:, :3, 3] @ z.T - carried[:, :3, 3]
+    found = np.asarray(np.linalg.lstsq(stack_rows(left), right.ravel(), rcond=None)[0], float)
+    return rigid(x, found[:3]), rigid(z, found[3:])
 
 
 def best_rotations(given: RotationTriple, rng: np.random.Generator) -> RotationTriple:
@@ -149,40 +231,3 @@ def with_translations(given: RotationTriple, rotations: RotationTriple) -> Rotat
     right = c[:, :3, 3] @ y.T - a[:, :3, 3] - seen
     found = np.linalg.lstsq(stack_rows(rows), right.ravel(), rcond=None)[0]
     return rigid(x, found[:3]), rigid(y, found[3:6]), rigid(z, found[6:])
-
-
-def two_steps(a: Floats, b: Floats, c: Floats) -> RotationTriple:
-    """Return X, Y, Z (4, 4) by the paper's equation (6), from poses each (N, 4, 4).
-
-    (a) The poses at which the second arm rests are eye-in-hand for the first; (b) those at which
-    the first rests are eye-on-base for the second; (c) chains the two.
-
-    Raises:
-        CalibrationRefused: Fewer than three poses share a place of either arm.
-    """
-    first, second = _resting(c), _resting(a)
-    _require_rest(len(first), "second", "first")
-    _require_rest(len(second), "first", "second")
-    x = park_martin(motions_of(a[first], b[first]))
-    eyes = invert(b[second])
-    z = park_martin(motions_of(c[second], eyes))
-    base2_T_camera = place_of(c[second], z, eyes)
-    y = a[second[0]] @ x @ invert(base2_T_camera)
-    return x, y, z
-
-
-def _resting(poses: Floats) -> NDArray[np.intp]:
-    """Return the indices of the largest group of equal poses."""
-    apart = np.abs(poses[:, None] - poses[None]).max(axis=(2, 3))
-    # It rested between two poses that differ by less [rad, m]
-    together = apart < 1e-4
-    return np.flatnonzero(together[int(np.argmax(together.sum(axis=1)))])
-
-
-def _require_rest(count: int, resting: str, moving: str) -> None:
-    if count < 3:
-        raise CalibrationRefused(
-            f"the {resting} arm stands still at no more than {count} poses; 3 poses at which only "
-            f"the {moving} arm moves are needed",
-            "record such poses, or use solve.robust, which needs none",
-        )

@@ -1,1 +1,0 @@
-"""Closed forms of the literature, each from its paper. Arrays only."""
