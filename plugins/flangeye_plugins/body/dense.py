@@ -295,6 +295,8 @@ def _surface(
     ) * length * facing - rounded * bent  # along the normal; behind is positive
     at = np.flatnonzero(np.isfinite(met.depth) & (facing > GRAZING))
     at = at[np.abs(away[at]) < reach]  # excludes NaN, next to a step of depth
+    # Through the mounting face the scan shows the carrier, which may lie close behind it
+    at = at[~shape.on_carrier(origin + met.depth[at, None] * rays[at], met.normals[at])]
     place = origin + met.depth[at, None] * rays[at]
     errors = np.column_stack([np.zeros((len(at), FACINGS)), -bent[at]])
     return _equations(place, met.normals[at], -away[at], pose, shape, errors)

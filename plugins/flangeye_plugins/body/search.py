@@ -56,10 +56,20 @@ class BodyVerdict(NamedTuple):
     @property
     def bounded(self) -> bool:
         """Whether the body's outline is seen, or nothing is seen around it."""
+        ends = self.ended >= self._least or self.beside < self._least
+        # Its surface may go on where something is fastened to it
+        return self.outline > 0 and ends and self.goes_on <= 0.5 * self.beside
+
+    @property
+    def framed(self) -> bool:
+        """Whether hardly anything is seen around the body but things before it."""
+        return self.outline > 0 and self.ended + self.crossing < self._least
+
+    @property
+    def _least(self) -> float:
         # Smallest share of the outline that must end before something farther: otherwise a plate
         # would fit any face of a box
-        least = 0.03 * self.outline
-        return self.outline > 0 and (self.ended >= least or self.beside < least)
+        return 0.03 * self.outline
 
     @property
     def shown(self) -> float:
@@ -98,7 +108,7 @@ class BodyVerdict(NamedTuple):
         """Score of a pose: number of agreeing rays, less weighted contradicting ones."""
         held = self.agree if self.bounded else 0
         # One contradicting ray outweighs ten agreeing ones: the true pose has hardly any
-        return held - 10 * self.against - self.goes_on
+        return held - 10 * (self.against + self.crossing)
 
 
 def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> BodyVerdict:
@@ -159,9 +169,12 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     depth, facets = met.depth.reshape(rays.shape[:2]), met.facets.reshape(rays.shape[:2])
     normals = (met.normals @ rotation.T).reshape(rays.shape)
     hit = np.isfinite(depth)
-    off = np.einsum("ijk,ijk->ij", normals, scan - np.where(hit, depth, 0.0)[..., None] * rays)
+    surface = np.where(hit, depth, 0.0)[..., None] * rays
+    off = np.einsum("ijk,ijk->ij", normals, scan - surface)
     due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
     due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
+    place = origin + surface.reshape(-1, 3) @ rotation
+    due &= ~shape.on_carrier(place, met.normals).reshape(due.shape)
     agree = due & (np.abs(off) < tolerance)
     before = (off > 2 * tolerance) & ~_hides(shape, scan, depth)
     behind = off < -2 * tolerance
@@ -231,7 +244,7 @@ def _window(shape: Shape, view: CoarseImage, pose: Floats) -> tuple[slice, slice
 
 
 def candidate_poses(ends: OrientedPoints, view: CoarseImage, looks: Looks, effort: float) -> Floats:
-    """Return poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan, 500 per effort.
+    """Return poses (K, 4, 4) ``camera_T_body`` that are consistent with a scan, 200 per effort.
 
     Args:
         ends: Ends of surfaces in the scan.
@@ -246,7 +259,8 @@ def candidate_poses(ends: OrientedPoints, view: CoarseImage, looks: Looks, effor
     # Poses are refined by one ICP step before 40 points select the best
     poses = _chunked(poses, partial(looks.settled, view=view, count=16, reach=0.1 * looks.size))
     scores = looks.scores(poses, view, 40, 0.05)
-    return poses[_best_of(scores, int(500 * effort))].astype(np.float64)
+    # Many alike lie a face on a table; a thin body's own pose would not be among the best
+    return poses[distinct(poses, scores, looks, int(200 * effort))].astype(np.float64)
 
 
 def _best_of(scores: Floats, most: int) -> Indices:
@@ -336,18 +350,19 @@ class BodySearch:
 
     def everywhere(self) -> list[FoundPose]:
         """Return distinct candidate poses of the body, best first."""
-        found = self._searched(1)
-        if any(map(self.passes, found)):
+        found = self._searched(self._coarse, 1)
+        # A pose half as certain would pass too, so it is no chance fit beside a pose not yet found
+        if any(self.passes(one._replace(weakest=2 * one.weakest)) for one in found):
             return found
         # An edge-on plate shows few ends, and in a coarse scan many poses look alike
-        return self._distinct(found + self._searched(4))
+        return self._distinct(found + self._searched(self._fine, 4))
 
     def quickly(self, trust: float) -> list[FoundPose]:
         """Return what ``everywhere`` does, by less effort, if a share ``trust`` of rays agree."""
-        return self._searched(0.5, trust)
+        return self._searched(self._coarse, 0.5, trust)
 
-    def _searched(self, effort: float, trust: float = 0.0) -> list[FoundPose]:
-        poses = candidate_poses(self._ends, self._coarse, self.looks, effort)
+    def _searched(self, view: CoarseImage, effort: float, trust: float = 0.0) -> list[FoundPose]:
+        poses = candidate_poses(view.edges(self.looks.size), view, self.looks, effort)
         # Points of the body that settle them, how far from the body the scan is taken for
         # it, move by move, and how far off it may be where it is judged, as shares of the
         # size, and how many are kept
@@ -355,8 +370,8 @@ class BodySearch:
             (40, (0.06, 0.05), 0.03, int(200 * effort)),
             (160, (0.04, 0.03, 0.02), 0.02, int(40 * effort)),
         ):
-            poses = self._settled(poses, count, reaches)
-            scores = self.looks.scores(poses, self._coarse, count, tolerance)
+            poses = self._settled(view, poses, count, reaches)
+            scores = self.looks.scores(poses, view, count, tolerance)
             poses = poses[distinct(poses, scores, self.looks, left)]
         found = self.near(poses, trust=trust)
         if not found:
@@ -367,10 +382,10 @@ class BodySearch:
         return self._distinct(found + turned)
 
     def _settled(
-        self, poses: Floats, count: int = 160, reaches: tuple[float, ...] = (0.06, 0.04, 0.03)
+        self, view: CoarseImage, poses: Floats, count: int, reaches: tuple[float, ...]
     ) -> Floats:
         for reach in reaches:
-            poses = self.looks.settled(poses, self._coarse, count, reach * self.looks.size)
+            poses = self.looks.settled(poses, view, count, reach * self.looks.size)
         return poses
 
     def near(self, poses: Floats, least: float = 0.0, trust: float = 0.0) -> list[FoundPose]:
@@ -412,7 +427,9 @@ class BodySearch:
 
     def images(self, found: FoundPose) -> list[FoundPose]:
         """Return left-handed poses of the mirrored body that fit the scan nearly as well."""
-        poses = self._settled(self.looks.reflections(found.pose))
+        poses = self._settled(
+            self._coarse, self.looks.reflections(found.pose), 160, (0.06, 0.04, 0.03)
+        )
         return self.near(poses, 0.9 * found.verdict.agree)
 
     def unrivalled(self, found: list[FoundPose], rivals: list[FoundPose]) -> list[FoundPose]:
@@ -449,10 +466,6 @@ class BodySearch:
     def _coarse(self) -> CoarseImage:
         """The scan in cells as wide as a pose is rough, with less noise than single points."""
         return view_of(self.points, self.looks.size / 60)
-
-    @cached_property
-    def _ends(self) -> OrientedPoints:
-        return self._coarse.edges(self.looks.size)
 
     @cached_property
     def _fine(self) -> CoarseImage:

@@ -193,6 +193,8 @@ class Shape:
     def surface(self) -> OrientedPoints:
         """Sample points of the outer surface, one per voxel and main direction of the normal."""
         points, normals = self.outside
+        free = ~self.on_carrier(points, normals)
+        points, normals = points[free], normals[free]
         keep = thin(points, normals, self.size / self.spacings)
         return OrientedPoints(points[keep], normals[keep], normals[keep])
 
@@ -216,8 +218,12 @@ class Shape:
         side = np.einsum("ni,ni->n", ends.normals, outwards[nearest])
         ends = ends._replace(normals=ends.normals * np.sign(side)[:, None])
         # At the foot of a mounted body the carrier may continue its faces: these ends are left out
-        stands = (ends.directions[:, 2] < -self.crease) & self.at_foot(ends.points)
+        stands = self.on_carrier(ends.points, ends.directions)
         return ends.take((np.abs(side) > self.crease) & ~stands)
+
+    def on_carrier(self, points: Floats, directions: Floats) -> Mask:
+        """Return the mask (N,) of points at a mounted body's foot, directed towards its carrier."""
+        return (directions[:, 2] < -self.crease) & self.at_foot(points)
 
     def at_foot(self, points: Floats) -> Mask:
         """Return the mask (N,) of points at a mounted body's mounting face."""

@@ -268,22 +268,20 @@ def _otherwise(body: TargetBody) -> list[tuple[str, str, TargetBody]]:
 
 
 def _passes(
-    found: FoundPose, coverage: float, trust: float, goes_on: float = 0.5, weakest: float = FIRM
+    found: FoundPose, coverage: float, trust: float, goes_on: float = 1.0, weakest: float = FIRM
 ) -> bool:
     verdict = found.verdict
-    # Fewer rays, a hundredth of the body's size apart, and a smaller share of its broadest side fit
-    # other things by chance, as the end of a torch does; an edge-on plate shows more
-    fewest, least = 150, 0.07
-    # Largest share of the rays beside the body in which its surface goes on: where something is
-    # fastened to it
+    # Fewer rays, a hundredth of the body's size apart, fit other things by chance
+    fewest = 150
+    # So does less of its broadest view, as the end of a torch does, and what is seen through a gap
+    little = found.seen < 0.07 or not verdict.bounded
     return (
         verdict.shown >= coverage
         and verdict.trusted >= trust
         and verdict.agree >= fewest
-        and found.seen >= least
-        and verdict.bounded
+        and (verdict.bounded or verdict.framed)
         and verdict.goes_on <= goes_on * verdict.beside
-        and found.weakest <= weakest
+        and found.weakest <= (weakest / 2 if little else weakest)
     )
 
 

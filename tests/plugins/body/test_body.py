@@ -38,7 +38,6 @@ from flangeye_emulators.world.raycast import RaycastScene, SolidBody
 from flangeye_emulators.world.scanner import scanner_of
 from flangeye_plugins.body.looks import prepared
 from flangeye_plugins.body.search import BodySearch, BodyVerdict, FoundPose
-from flangeye_plugins.body.search import around as points_around
 from flangeye_plugins.fit.body import FitBodyParams, fit_body
 from flangeye_plugins.segment.body import SegmentBodyParams, segment_body
 from tools.study_bodies import SCANNER, as_made, scene, trial
@@ -474,17 +473,32 @@ def test_a_scan_too_coarse_for_a_body_says_so() -> None:
 
 
 def test_a_fit_that_rests_on_other_edges_is_refused() -> None:
-    """A ring plate laid 1.2 mm aside, where its surfaces fit as well."""
-    capture, plate, pose = among_others("ring-plate", 23)
-    points, looks = capture.cloud.points(), prepared(plate)
-    every = BodySearch(points, looks, PASSES).everywhere()
-    assert not any(map(PASSES, every))
-    aside = every[0].pose
-    assert np.linalg.norm((aside - pose)[:3, 3]) == pytest.approx(1.2e-3, abs=0.2e-3)
-    near = PointCloud(CAMERA, points_around(points, looks, aside))
-    laid = FlangeCloud(near, aside[:3, 3], np.array([0, 0, -1.0]), aside)
-    told = fit_body(laid, plate, FitBodyParams(), SCANNER)
+    """A plate's dome says where it is, and the ends of the plate are 2 mm aside of there."""
+
+    def domed(aside: float) -> TargetBody:
+        dome = trimesh.creation.icosphere(4, 0.03)
+        plate = trimesh.creation.box((0.14, 0.1, 0.003)).apply_translation([aside, 0.0, 0.0])
+        faces = np.concatenate([dome.faces, plate.faces + len(dome.vertices)])
+        return TargetBody("dome", np.concatenate([dome.vertices, plate.vertices]), faces)
+
+    told = fit_body(around(scan(domed(2e-3)), POSE), domed(0.0), FitBodyParams(), SCANNER)
+    assert isinstance(told, Rejected), told
     assert "the fit used edges of another object" in told.reason
+    aligned = fit_body(around(scan(domed(0.0)), POSE), domed(0.0), FitBodyParams(), SCANNER)
+    assert isinstance(aligned, PoseFeature), aligned
+
+
+def test_the_carrier_right_behind_the_mounting_face_is_not_taken_for_it() -> None:
+    """Seen from behind, the plate's foot is where the flange's wall goes on with its radius."""
+    told = trial("ring-plate", 81073)
+    assert [np.linalg.norm(off(one, told.pose)[3:]) < 0.6e-3 for one in told.found] == [True]
+
+
+@pytest.mark.parametrize("seed", [81009, 81033, 81035, 81315])
+def test_a_thin_body_is_found_beside_things_that_fit_its_face(seed: int) -> None:
+    """Seen nearly edge on, where many poses lay its broad face on the table or on a box."""
+    told = trial("ring-plate", seed)
+    assert [np.linalg.norm(off(one, told.pose)[3:]) < 1e-3 for one in told.found] == [True]
 
 
 @pytest.mark.parametrize(("scale", "why"), [(1.01, "smaller"), (1 / 1.01, "larger")])
