@@ -21,6 +21,8 @@ from flangeye_plugins.fit.boards import CheckerboardParams
 MATRIX = np.array([[1000.0, 0, 407], [0, 1003, 295], [0, 0, 1]])
 LENS = np.array([-0.12, 0.05, 0.001, -0.0005, 0.0])
 CAMERA = BoardCamera(MATRIX, (800, 600), LENS)
+HALF = BoardCamera(np.array([[500.0, 0, 203.25], [0, 501.5, 147.25], [0, 0, 1]]), (400, 300), LENS)
+"""The same camera with pixels of twice the width: where a board is not found, time goes by pixels."""
 BOARD = Board("charuco", 7, 5, 0.03, 0.022)
 OF_BOARD = SeenBoardParams(columns=7, rows=5, square=SI(0.03), marker=SI(0.022))
 CIRCLES = Board("circles", 4, 11, 0.016, 0.014)
@@ -35,10 +37,10 @@ def poses(count, tilt=0.45):
         )
 
 
-def images(board, count, tilt=0.45):
+def images(board, count, tilt=0.45, camera=CAMERA):
     rng = np.random.default_rng(1)
     return {
-        str(k): np.asarray(render_board(board, pose, CAMERA, rng).pixels)
+        str(k): np.asarray(render_board(board, pose, camera, rng).pixels)
         for k, pose in enumerate(poses(count, tilt))
     }
 
@@ -101,7 +103,7 @@ def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_name
     shown: Board | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
-    seen = images(shown, 12, 0.2) if shown else {str(k): pixels for k in range(12)}
+    seen = images(shown, 12, 0.2, HALF) if shown else {str(k): pixels for k in range(12)}
     looked = []
 
     def counted(board, image, thorough=True):
@@ -117,7 +119,7 @@ def test_a_board_that_is_in_no_image_ends_early_and_the_one_that_is_seen_is_name
 
 def test_a_board_in_a_mirror_is_named_as_that() -> None:
     board = Board("charuco", 7, 5, 0.03, 0.022)
-    seen = {name: pixels[:, ::-1] for name, pixels in images(board, 9, 0.2).items()}
+    seen = {name: pixels[:, ::-1] for name, pixels in images(board, 9, 0.2, HALF).items()}
     with pytest.raises(StageError, match="0: it shows the board mirrored: switch off image"):
         lens_of(seen, board)
 
@@ -171,10 +173,10 @@ def test_a_calibration_of_another_image_size_is_said(
 
 
 def test_images_of_a_known_camera_without_the_board_that_is_fitted_end_early(
-    views: Any, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
-    reader = written_with_poses(tmp_path, views)
-    lens = {"focal_length": (1000.0, 1003.0), "principal_point": (407.0, 295.0)}
+    reader = written_with_poses(tmp_path, images(BOARD, 12, camera=HALF))
+    lens = {"focal_length": (500.0, 501.5), "principal_point": (203.25, 147.25)}
     params = ImagesParams(path=tmp_path, reader=reader, **lens)
     fitted = CheckerboardParams(columns=10, rows=7, square=SI(0.02)).board
     with pytest.raises(StageError, match=r"none of 8 of the 12 images.*\(checkerboard, 10 x 7\)"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +31,19 @@ from tests.plugins.robot.cell import until
 STILL = np.zeros(6)
 
 
+@pytest.fixture(scope="class")
+def running() -> Iterator[Process]:
+    with Process() as controller:
+        yield controller
+
+
+@pytest.fixture
+def controller(running: Process) -> Process:
+    """A controller as after power-on."""
+    running.control.reset()
+    return running
+
+
 class TestSimulated(ArcConformance):
     part = arc_simulated
     params = SimulatedArcParams()
@@ -45,10 +59,8 @@ class TestUrDigital(ArcConformance):
     unreachable = UrDigitalParams(host=free_address(), output=3)
 
     @pytest.fixture(autouse=True)
-    def controller(self) -> Any:
-        with Process() as controller:
-            self.host = controller.host
-            yield
+    def of(self, controller: Process) -> None:
+        self.host = controller.host
 
     def open(self) -> Any:
         params = UrDigitalParams(host=self.host, output=3, gas=1, established=3)
@@ -187,8 +199,10 @@ def outputs(controller: Process) -> int:
     return int(controller.control.state()["digital_outputs"])
 
 
-def test_outputs_go_high_and_low_and_the_input_says_whether_it_burns() -> None:
-    with Process() as controller:
+class TestOutputs:
+    def test_outputs_go_high_and_low_and_the_input_says_whether_it_burns(
+        self, controller: Process
+    ) -> None:
         params = UrDigitalParams(host=controller.host, output=3, gas=1, established=3)
         with arc_ur_digital.function(params) as arc:
             arc.gas(True)
@@ -203,9 +217,9 @@ def test_outputs_go_high_and_low_and_the_input_says_whether_it_burns() -> None:
         with pytest.raises(DeviceError, match="is closed"):
             arc.burn(True)
 
-
-def test_an_arc_that_nothing_watches_does_not_say_that_it_is_out() -> None:
-    with Process() as controller:
+    def test_an_arc_that_nothing_watches_does_not_say_that_it_is_out(
+        self, controller: Process
+    ) -> None:
         params = UrDigitalParams(host=controller.host, output=3)
         arc: Any = arc_ur_digital.function(params)
         arc.gas(True)  # it has no valve of its own
@@ -214,9 +228,7 @@ def test_an_arc_that_nothing_watches_does_not_say_that_it_is_out() -> None:
         until(lambda: outputs(controller) == 0b1000, 1.0)
         arc.close()
 
-
-def test_outputs_that_another_client_has_are_refused() -> None:
-    with Process() as controller:
+    def test_outputs_that_another_client_has_are_refused(self, controller: Process) -> None:
         params = UrDigitalParams(host=controller.host, output=3)
         with (
             arc_ur_digital.function(params),
