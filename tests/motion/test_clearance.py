@@ -157,3 +157,19 @@ def test_a_body_is_seen_where_the_flange_carries_it() -> None:
     assert np.abs(own / (0.05, 0.03, 0.02)).max(axis=1) == pytest.approx(1.0, abs=1e-9)
     shown = placed.faces(flange[:3, 3] + 0.5 * flange[:3, 2]) > 0
     assert shown[own[:, 2] > 0.02 - 1e-9].all() and not shown[own[:, 2] < 0.018].any()
+
+
+@pytest.mark.parametrize("away", [0.2, 0.8])
+def test_what_an_eye_sees_of_a_body_is_its_solid_angle(away: float) -> None:
+    """Of a cube's face of side a, seen square on from d away: 4 atan(a^2 / 2d sqrt(4d^2 + 2a^2))."""
+    arm, side = Arm(load_model("robots", "ur5e")), 0.1
+    mesh = trimesh.creation.box((side, side, side))
+    cube = TargetBody("cube", np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+    joints = np.radians([10.0, -125.0, -105.0, -40.0, -90.0, 170.0])
+    flange = arm.flange(joints)
+    seen = BodyView(cube, arm).placed(joints).faces(
+        flange[:3, 3] + (away + side / 2) * flange[:3, 2]
+    )  # fmt: skip
+    angle = seen.mean() * 6 * side**2
+    exact = 4 * np.arctan(side**2 / (2 * away * np.sqrt(4 * away**2 + 2 * side**2)))
+    assert angle == pytest.approx(exact, rel=0.1)  # 600 points, of which a sixth is seen
