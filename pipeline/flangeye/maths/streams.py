@@ -67,6 +67,10 @@ def interpolated(times: Floats, poses: Floats, at: Floats) -> Floats:
     from scipy.spatial.transform import Rotation, Slerp
 
     inside = np.clip(at, times[0], times[-1])
+    # Of a long stream the samples about these times alone
+    first = max(int(np.searchsorted(times, inside.min())) - 1, 0)
+    last = int(np.searchsorted(times, inside.max())) + 2
+    times, poses = times[first:last], poses[first:last]
     turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(inside).as_matrix()
     moved = rows_at(inside, times, poses[:, :3, 3])
     return np.array([rigid(r, p) for r, p in zip(turned, moved, strict=True)])
