@@ -1,6 +1,7 @@
 """Which poses of the flange are asked of an arm: seen, lit, clear, and near to where it stands."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 import trimesh
 
 from flangeye.maths.kinematics import Arm
-from flangeye.models.bodies import arm_body, load_body
+from flangeye.models.bodies import TargetBody, arm_body, load_body
 from flangeye.models.loading import load_model
 from flangeye.models.robots import Volume
 from flangeye.models.urdf import robot_from_urdf
@@ -25,6 +26,12 @@ AHEAD = np.array([0.6, 0.0, 0.3])
 OVERHEAD = np.array([[0, -1, 0, 0.6], [-1, 0, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]], dtype=float)
 SHOWN = np.radians([10.0, -125.0, -105.0, -40.0, -90.0, 170.0])
 """A posture with the flange below the scanner, facing it."""
+
+
+@cache
+def body(name: str) -> TargetBody:
+    """A body of the project; what is worked out of its mesh is kept with it."""
+    return load_body(name, None, Path())
 
 
 def scanner(**more: Any) -> Any:
@@ -315,16 +322,16 @@ def test_a_scanner_s_housing_reaches_ten_centimetres_about_its_eyes() -> None:
     for away, clear in ((0.149, False), (0.151, True)):
         camera = OVERHEAD.copy()
         camera[:3, 3] = np.array(tip) + [away, 0.0, 0.0]
-        beyond = Reach(robot, scanner(), camera, load_body("ring-plate", None, Path()))
+        beyond = Reach(robot, scanner(), camera, body("ring-plate"))
         assert beyond._clear(SHOWN) is clear
 
 
-TORCH = load_body("torch", None, Path())
+TORCH = body("torch")
 
 
-@pytest.mark.parametrize("body", ["gripper", "torch", "ring-plate"])
-def test_a_body_is_shown_by_most_of_what_faces_the_camera(body: str) -> None:
-    tool = load_body(body, None, Path())
+@pytest.mark.parametrize("name", ["gripper", "torch", "ring-plate"])
+def test_a_body_is_shown_by_most_of_what_faces_the_camera(name: str) -> None:
+    tool = body(name)
     arm = Reach(MODEL, load_model("scanners", "phoxi-m"), OVERHEAD, tool)
     site = Site(
         arm.middle(), OVERHEAD[:3, 3], arm.facing_rotation, arm.joints, shown=lambda: arm.shown
@@ -343,7 +350,7 @@ def test_a_flat_body_turns_its_broad_side_to_the_camera_not_to_a_projector_aside
     lean = np.radians(40.0)  # the axes meet where the body is shown
     aside = {"baseline": 1.4 * np.sin(lean), "convergence": lean}
     eye = scanner(near=0.1, far=9.0, field_of_view=np.radians([100.0, 100.0]), **aside)
-    arm = Reach(MODEL, eye, OVERHEAD, load_body("ring-plate", None, Path()))
+    arm = Reach(MODEL, eye, OVERHEAD, body("ring-plate"))
     assert arm.facing_rotation(AHEAD) is not None
     assert np.abs(arm.shown) == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
 
@@ -402,9 +409,9 @@ def test_what_the_projector_does_not_light_is_not_seen() -> None:
     wide = {"near": 0.1, "far": 9.0, "field_of_view": np.radians([120.0, 120.0])}
     camera = ARM.flange(SHOWN) @ rigid(rotation_from_rpy(np.pi, 0.0, 0.0), np.zeros(3))
     camera[:3, 3] -= 0.8 * camera[:3, 2]
-    body = load_body("gripper", None, Path())
+    gripper = body("gripper")
     alone, aside = (
-        Reach(MODEL, scanner(**wide, baseline=at), camera, body)._seen(SHOWN)[1]
+        Reach(MODEL, scanner(**wide, baseline=at), camera, gripper)._seen(SHOWN)[1]
         for at in (0.0, 0.8)
     )
     assert alone == pytest.approx(1.0) and aside < 0.8

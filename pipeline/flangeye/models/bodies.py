@@ -17,7 +17,7 @@ from flangeye.files.paths import bundled
 from flangeye.files.words import nearest
 from flangeye.maths.kinematics import Arm
 from flangeye.models.robots import RobotModel
-from flangeye.models.urdf_meshes import fit_capsule
+from flangeye.models.urdf_meshes import Capsule, fit_capsule
 from flangeye.models.workpiece import MESHES, STEP_SUFFIXES, read_mesh
 from flangeye.types import Floats, Indices
 from flangeye.types.geometry import each_applied, invert
@@ -46,6 +46,11 @@ class TargetBody:
     def size(self) -> float:
         """Diagonal of the box around it [m]."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    @cached_property
+    def capsule(self) -> Capsule:
+        """A small capsule around it."""
+        return fit_capsule(self.vertices)
 
     @cached_property
     def digest(self) -> str:
@@ -176,7 +181,7 @@ def carrying(robot: RobotModel, body: TargetBody | None) -> RobotModel:
     if body is None or isinstance(body, ArmBody):
         # The arm's own links are in its volumes already.
         return robot
-    return robot.carrying(*fit_capsule(body.vertices))
+    return robot.carrying(*body.capsule)
 
 
 def _read(path: Path) -> tuple[Floats, NDArray[np.int32]]:

@@ -254,13 +254,15 @@ def _along(points: Floats, direction: Floats) -> Capsule:
 
 def _middle(flat: Floats) -> Floats:
     """Return nearly the centre of the smallest circle about (N, 2) points (Badoiu, Clarkson)."""
-    flat = _outermost(flat)
-    centre = (flat.min(axis=0) + flat.max(axis=0)) / 2
+    # A row for each coordinate: along pairs of numbers NumPy takes twice as long
+    x, y = np.ascontiguousarray(_outermost(flat).T)
+    at_x, at_y = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
     # Steps towards the smallest circle; its radius is then too large by a thousandth at most
     for step in range(1, 2000):
-        farthest = flat[((flat - centre) ** 2).sum(axis=1).argmax()]
-        centre = centre + (farthest - centre) / (step + 1)
-    return np.asarray(centre)
+        farthest = ((x - at_x) ** 2 + (y - at_y) ** 2).argmax()
+        at_x += (x[farthest] - at_x) / (step + 1)
+        at_y += (y[farthest] - at_y) / (step + 1)
+    return np.array([at_x, at_y])
 
 
 def _outermost(flat: Floats) -> Floats:

@@ -72,6 +72,11 @@ def scan(body: TargetBody, pose=POSE, seed: int = 0) -> Capture:
     return Capture("0000", PointCloud(CAMERA, xyz), {FLANGE: Transform(BASE, FLANGE, pose)})
 
 
+@cache
+def gripper_seen() -> Capture:
+    return scan(GRIPPER)
+
+
 def found(
     capture: Capture, body: TargetBody = GRIPPER, earlier: tuple[Observation, ...] = ()
 ) -> FlangeCloud | Rejected:
@@ -103,7 +108,7 @@ def off(feature: PoseFeature, pose=POSE):
 
 
 def test_a_gripper_is_found_without_a_guess_and_its_error_is_as_stated() -> None:
-    feature = fit_body(found(scan(GRIPPER)), GRIPPER, FitBodyParams())
+    feature = fit_body(found(gripper_seen()), GRIPPER, FitBodyParams())
     assert isinstance(feature, PoseFeature), feature
     error = off(feature)
     assert np.linalg.norm(error[3:]) < 0.5e-3
@@ -187,7 +192,7 @@ def test_a_flange_that_shows_beside_the_tool_counts_too(
 
 
 def test_a_scanner_without_a_model_has_the_distortion_that_is_stated() -> None:
-    capture = around(scan(GRIPPER), POSE)
+    capture = around(gripper_seen(), POSE)
     wide = {"model_error": "0 mm", "scanner_error": "1 mm"}
     feature = fit_body(capture, GRIPPER, FitBodyParams.model_validate(wide))
     assert isinstance(feature, PoseFeature), feature
@@ -222,11 +227,11 @@ def test_two_poses_that_explain_a_scan_alike_are_kept_until_the_arms_motion_tell
 
 def test_an_earlier_sighting_that_was_wrong_does_no_harm() -> None:
     wrong = sighting(POSE @ HALF_TURN)
-    assert is_at(POSE, found(scan(GRIPPER), earlier=wrong))
+    assert is_at(POSE, found(gripper_seen(), earlier=wrong))
 
 
 def test_a_body_that_is_not_there_is_refused() -> None:
-    absent = found(scan(GRIPPER), shipped("torch"))
+    absent = found(gripper_seen(), shipped("torch"))
     assert isinstance(absent, Rejected)
     assert "no pose of torch" in absent.reason
 
@@ -373,7 +378,7 @@ def test_a_part_that_stands_elsewhere_is_named(further: float) -> None:
 
 
 def test_fit_body_needs_segment_body() -> None:
-    cloud = FlangeCloud(scan(GRIPPER).cloud, np.zeros(3), np.array([0, 0, -1.0]))
+    cloud = FlangeCloud(gripper_seen().cloud, np.zeros(3), np.array([0, 0, -1.0]))
     assert "segment.body" in fit_body(cloud, GRIPPER, FitBodyParams()).reason
 
 
@@ -504,7 +509,7 @@ def test_a_thin_body_is_found_beside_things_that_fit_its_face(seed: int) -> None
 @pytest.mark.parametrize(("scale", "why"), [(1.01, "smaller"), (1 / 1.01, "larger")])
 def test_a_mesh_of_another_size_is_refused_by_what_the_scan_shows(scale: float, why: str) -> None:
     other = TargetBody("gripper", GRIPPER.vertices * scale, GRIPPER.triangles)
-    refused = fit_body(around(scan(GRIPPER), POSE), other, FitBodyParams(), SCANNER)
+    refused = fit_body(around(gripper_seen(), POSE), other, FitBodyParams(), SCANNER)
     assert isinstance(refused, Rejected)
     assert "in another size than its mesh" in refused.reason
     figure = re.match(rf"{why} by at least (\S+)%", refused.figures)
