@@ -204,8 +204,9 @@ def reached_from(arm: Arm, base_T_flange: Floats, near: Floats) -> tuple[Floats,
     wanted = base_T_flange.reshape(-1, 4, 4)
     joints = np.array(np.broadcast_to(near, (*shape, arm.n)), dtype=np.float64).reshape(-1, arm.n)
     far = np.arange(len(wanted))
-    # Newton steps; no joint moves more than 0.2 rad in one, so that the arm stays on its branch
-    for _ in range(200):
+    # Newton steps; no joint moves more than 0.2 rad in one, so that the arm stays on its branch.
+    # Twice as many as a whole turn takes: what is not reached by then is out of reach
+    for _ in range(64):
         frames = arm.frames(joints[far])
         twist = _twist(wanted[far], arm.flange_of(frames))
         # Converged: the joint angles reach the pose this closely [rad, m]
