@@ -103,6 +103,7 @@ class Looks(Shape):
     def views(self) -> Floats:
         """Viewing directions (V, 3), from the scanner to the body."""
         # 128 directions, about 20 degrees apart, are enough for occlusions
+        # 128 directions, about 20 degrees apart, are enough for occlusions
         return spread_directions(128)
 
     @cached_property
@@ -158,19 +159,19 @@ class Looks(Shape):
         off, behind, cosine = view.compared(placed, facing)
         there = (np.abs(off) < reach) & (cosine > SIMILAR) & (np.abs(behind) < 3 * reach)
         through, wrong = behind > 2 * reach, (np.abs(behind) < 2 * reach) & ~there
-        return np.asarray(
-            there.mean(axis=1) - self.against * through.mean(axis=1) - 0.5 * wrong.mean(axis=1)
-        )
+        worth = there - self.against * through - 0.5 * wrong
+        return _mean(worth, _turned_here(placed, facing))
 
     def _ends_score(self, poses: Floats, view: CoarseImage, at: Indices, reach: float) -> Floats:
         placed, outwards = _placed(poses, *self._singles[1], at)
         offset, cosine = view.to_end(placed, outwards)
         there = (np.einsum("kni,kni->kn", offset, offset) < reach**2) & (cosine > SIMILAR)
-        placed = placed + self.beyond * self.size * outwards
         facing = self._end_normals[at] @ poses[:, :3, :3].transpose(0, 2, 1)
+        here = _turned_here(placed, facing)
+        placed = placed + self.beyond * self.size * outwards
         off, behind, cosine = view.compared(placed, facing)
         on = (np.abs(off) < reach / 2) & (cosine > SIMILAR) & (np.abs(behind) < reach)
-        return np.asarray(there.mean(axis=1) - self.against * on.mean(axis=1))
+        return _mean(there - self.against * on, here)
 
     @cached_property
     def _end_normals(self) -> Floats:
@@ -299,6 +300,19 @@ def _apart(points: Floats, seen: Mask) -> Indices:
         gap[rows, last] = -1.0
     again = np.arange(LISTED) % np.maximum(many, 1)[:, None]
     return np.take_along_axis(out, again, axis=1)
+
+
+def _turned_here(placed: Floats, facing: Floats) -> Mask:
+    """Return the mask (K, N) of points whose face (K, N, 3) is turned to the scanner."""
+    # Of a direction 10 degrees aside, a plate seen edge on has another face in view
+    towards = np.einsum("kni,kni->kn", placed, facing)
+    return np.asarray(towards < -GRAZING * np.linalg.norm(placed, axis=2))
+
+
+def _mean(worth: Floats, here: Mask) -> Floats:
+    """Return the mean (K,) of what the points here are worth (K, N); a quarter of all at least."""
+    count = np.maximum(here.sum(axis=1), here.shape[1] / 4)
+    return np.asarray((worth * here).sum(axis=1) / count)
 
 
 def _placed(

@@ -355,7 +355,7 @@ class BodySearch:
         if any(self.passes(one._replace(weakest=2 * one.weakest)) for one in found):
             return found
         # An edge-on plate shows few ends, and in a coarse scan many poses look alike
-        return self._distinct(found + self._searched(self._fine, 4))
+        return self._distinct(found + self._searched(self._fine, 2))
 
     def quickly(self, trust: float) -> list[FoundPose]:
         """Return what ``everywhere`` does, by less effort, if a share ``trust`` of rays agree."""
