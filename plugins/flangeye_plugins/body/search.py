@@ -32,8 +32,8 @@ class BodyVerdict(NamedTuple):
     Attributes:
         due: Rays that should meet the body's surface, away from its edges.
         agree: Rays of ``due`` that measured the surface where it should be.
-        against: Rays of ``due`` that contradict: they measured something behind the body, or too
-            close before it to be an occluder.
+        against: Rays that contradict: they measured something behind the body, its mounting face
+            included, or too close before the surface to be an occluder.
         goes_on: Rays beside the body that show its surface continued beyond its end.
         beside: Rays beside the body with a measurement.
         ended: Rays beside the body that show something behind it.
@@ -171,15 +171,16 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     hit = np.isfinite(depth)
     surface = np.where(hit, depth, 0.0)[..., None] * rays
     off = np.einsum("ijk,ijk->ij", normals, scan - surface)
-    due = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
-    due &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
+    facing = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
+    facing &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
+    # At its mounting face the carrier is seen, and nothing behind
     place = origin + surface.reshape(-1, 3) @ rotation
-    due &= ~shape.on_carrier(place, met.normals).reshape(due.shape)
+    due = facing & ~shape.on_carrier(place, met.normals).reshape(facing.shape)
     agree = due & (np.abs(off) < tolerance)
-    before = (off > 2 * tolerance) & ~_hides(shape, scan, depth)
-    behind = off < -2 * tolerance
+    before = due & (off > 2 * tolerance) & ~_hides(shape, scan, depth)
+    behind = facing & (off < -2 * tolerance)
     # A single ray may be a mixed one, at an edge of the body.
-    against, through = (ndimage.binary_opening(due & seen) for seen in (behind | before, behind))
+    against, through = (ndimage.binary_opening(seen) for seen in (behind | before, behind))
     return _Compared(rays, scan, depth, normals, hit, due, agree, against, through, facets)
 
 
