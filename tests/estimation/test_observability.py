@@ -139,6 +139,8 @@ def test_fewer_sightings_do_than_unknowns_for_what_tells_more(
 
 def test_a_round_target_may_be_turned_about_its_axis_and_a_centre_about_all() -> None:
     for feature, turns in (("pose", []), ("normal", [8]), ("centre", [6, 7, 8])):
-        found = symmetry_moves(problem_in("eye-on-base, marker", feature, 8))
-        np.testing.assert_array_equal(found, np.eye(12)[:, turns])
-        assert symmetry_moves(problem_in("eye-on-base, flange", feature, 8)).shape == (6, 0)
+        placed = problem_in("eye-on-base, marker", feature, 8)
+        places = {name: np.eye(4) for name in placed.unknown}
+        np.testing.assert_array_equal(symmetry_moves(placed, places), np.eye(12)[:, turns])
+        known = problem_in("eye-on-base, flange", feature, 8)
+        assert symmetry_moves(known, places).shape == (6, 0)

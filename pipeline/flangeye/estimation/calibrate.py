@@ -22,12 +22,7 @@ from flangeye.estimation.answers.answer import (
 )
 from flangeye.estimation.answers.corrections import CORRECTED, corrected_part, corrections_of
 from flangeye.estimation.answers.work import Work, work_of
-from flangeye.estimation.certify.certified import (
-    answer_of,
-    certificate_notes,
-    moved_note,
-    verdict_of,
-)
+from flangeye.estimation.certify.certified import verdict_of
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
 from flangeye.estimation.graph import Places, Problem
@@ -213,13 +208,15 @@ def with_expected_error(
 def _at_best(session: Session) -> Session:
     """Return the session at the better answer that the certificate found, if any, with a note."""
     found = session.found
-    start = verdict_of(answer_of(found)).better
+    start = verdict_of(found).better
     if start is None:
         return session
     there = estimate(found.problem, start, found.effects, found.inliers)
     if there.posterior.cost >= found.posterior.cost:
         return session
-    return replace(session, found=there).noted(moved_note())
+    return replace(session, found=there).noted(
+        "the certificate found a likelier answer than the search; it is used"
+    )
 
 
 def _weak(session: Session, options: Options) -> Floats:
@@ -283,23 +280,17 @@ def _estimates(session: Session, answer: Answer, weak: Floats) -> list[Transform
     """
     problem, found = session.found.problem, session.found
     moved = _without(problem, problem.moved(found.places, answer.mean), weak)
-    rounds, out = symmetry_moves(problem), {}
+    rounds, out = symmetry_moves(problem, moved), {}
     for i, name in enumerate(problem.unknown):
         rows = slice(6 * i, 6 * i + 6)
         transform = Transform.named(session.cell.name_of(name), moved[name])
         # A turn of a round target is about its own axis.
-        free = np.hstack([weak[rows], _in_parent(moved[name], rounds[rows])])
+        free = np.hstack([weak[rows], rounds[rows]])
         own = {cause: share[rows, rows] for cause, share in answer.shares.items()}
         about = _about(session, transform)
         out[name] = _estimate(transform, answer.covariance[rows, rows], own, about, free)
     order = [n for n in session.cell.unknown_frames if n in out]
     return [out[name] for name in order]
-
-
-def _in_parent(place: Floats, moves: Floats) -> Floats:
-    out = moves.copy()
-    out[:3] = place[:3, :3] @ moves[:3]
-    return out
 
 
 def _without(problem: Problem, places: Places, weak: Floats) -> Places:
@@ -417,4 +408,4 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
             f"{'s' if weak.shape[1] > 1 else ''} parallel to the only axis about which the arm "
             f"turned"
         )
-    return [*notes, *(certificate_notes(answer_of(found)) if options.certify else ())]
+    return [*notes, verdict_of(found).note] if options.certify else notes

@@ -163,23 +163,21 @@ def fewest_sightings(problem: Problem) -> int:
     return (5 if normals else 8) if placed else (4 if normals else 6)
 
 
-def symmetry_moves(problem: Problem) -> Floats:
+def symmetry_moves(problem: Problem, places: Places) -> Floats:
     """Return (P, k) unit moves that are unobservable by definition: turns of round targets.
 
     A circle's turn about its own axis is unobservable, and so is every turn of a centre.
     """
-    columns = []
+    moves = [np.zeros((6 * len(problem.unknown), 0))]
     for i, name in enumerate(problem.unknown):
         pairs = [k for k, (_, target) in enumerate(problem.ends) if target == name]
         ranks = problem.seen.ranks[np.isin(problem.seen.pairs, pairs)]
         if not len(ranks) or ranks.max() == 6:
             continue
-        axes = [2] if ranks.max() == 5 else [0, 1, 2]
-        for axis in axes:
-            column = np.zeros(6 * len(problem.unknown))
-            column[6 * i + axis] = 1.0
-            columns.append(column)
-    return np.array(columns).reshape(len(columns), 6 * len(problem.unknown)).T
+        axes = places[name][:3, 2:3] if ranks.max() == 5 else places[name][:3, :3]
+        moves.append(np.zeros((len(moves[0]), axes.shape[1])))
+        moves[-1][6 * i : 6 * i + 3] = axes
+    return np.hstack(moves)
 
 
 def unobservable(
@@ -228,20 +226,11 @@ def _meaningful(problem: Problem, places: Places) -> Floats:
 
     A round target's turn about its own axis does not.
     """
-    nothing = _turned(problem, places, symmetry_moves(problem))
+    nothing = symmetry_moves(problem, places)
     if not nothing.shape[1]:
         return np.eye(len(nothing))
     # Left singular vectors beyond the rank span the orthogonal complement
     return np.asarray(np.linalg.svd(nothing, full_matrices=True)[0][:, nothing.shape[1] :])
-
-
-def _turned(problem: Problem, places: Places, moves: Floats) -> Floats:
-    """Rotate moves from the axes of the unknown frames to those of their parents."""
-    out = np.zeros_like(moves)
-    for i, name in enumerate(problem.unknown):
-        at = slice(6 * i, 6 * i + 3)
-        out[at] = places[name][:3, :3] @ moves[at]
-    return out
 
 
 def _of_what(problem: Problem, weak: Floats) -> str:

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
-from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Carrier, Linear, Problem
 from flangeye.maths.arm_correction import effects as field_effects
 from flangeye.maths.arm_correction import field_over
@@ -59,40 +59,29 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
     """Return the effects of one arm or rail; the arm's quality scales all their sizes."""
     carriers = [c for c in problem.carriers if c.arm == arm]
     accuracy = carriers[0].accuracy or ACCURACY
+    poses = np.asarray(problem.frames[carriers[0].frame].place)
     effects = []
     if _joints_of_all_known(problem, arm):
         for kind, (name, ratio) in ARM_ERRORS.items():
-            block = _of_carriers(arm, kind)
+            block = partial(_moved, arm, partial(_displaced, kind))
             effects.append(Effect(name, block, ratio * accuracy, QUALITY_SPREAD, arm, True, kind))
         # Half the play is lost on either side. No command contains it: at the work a joint comes
         # from either side
-        lag, block = 0.05 * accuracy, _of_carriers(arm, "backlash")
+        lag, block = 0.05 * accuracy, partial(_moved, arm, partial(_displaced, "backlash"))
         effects.append(Effect("backlash", block, lag, QUALITY_SPREAD, arm))
     else:
-        effects += [
-            Effect(
-                f"place of the {at}",
-                _in_common(arm, at == "base", rows),
-                size * accuracy,
-                QUALITY_SPREAD,
-                arm,
-                True,
-                COMMON,
-            )
-            for at in ("base", "flange")
-            for rows, size in zip((slice(3), slice(3, 6)), ANEW[at], strict=True)
-        ]
-        bent = _bent(arm, np.asarray(problem.frames[carriers[0].frame].place))
+        for at in ("base", "flange"):
+            for rows, ratio in zip((slice(3), slice(3, 6)), ANEW[at], strict=True):
+                block = partial(_moved, arm, partial(_in_common, at == "base", rows))
+                name, size = f"place of the {at}", ratio * accuracy
+                effects.append(Effect(name, block, size, QUALITY_SPREAD, arm, True, COMMON))
+        block = partial(_moved, arm, partial(_linear_in_pose, poses))
         name = "error linear in the pose"
-        effects.append(Effect(name, bent, accuracy, QUALITY_SPREAD, arm, True))
-    field = field_over(np.asarray(problem.frames[carriers[0].frame].place)[:, :3, 3])
-    block = _by_place(arm, field)
-    return [
-        *effects,
-        # What no kind explains, smooth over the workspace [m]; of it nothing is known
-        # beforehand: four times as much or as little, one sigma
-        Effect("smooth error", block, 0.1 * accuracy, 4.0, arm, True, "field"),
-    ]
+        effects.append(Effect(name, block, accuracy, QUALITY_SPREAD, arm, True))
+    # What no kind explains, smooth over the workspace [m]; of it nothing is known beforehand: four
+    # times as much or as little, one sigma
+    block = partial(_by_place, arm, field_over(poses[:, :3, 3]))
+    return [*effects, Effect("smooth error", block, 0.1 * accuracy, 4.0, arm, True, "field")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +111,10 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
         if _joints_of_all_known(problem, arm):
             # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
             # mm by ISO 9283 at a reach of a metre has 0.03 mrad
-            out.append(Scatter(_of_joints(arm), 0.1 * accuracy, QUALITY))
+            out.append(Scatter(partial(_joint_noise, arm), 0.1 * accuracy, QUALITY))
         else:
-            turns, shifts = (_pose_noise(arm, rows) for rows in (slice(3), slice(3, 6)))
-            turned, shifted = ANEW["each"]
-            out.append(Scatter(turns, turned * accuracy, QUALITY))
-            out.append(Scatter(shifts, shifted * accuracy, QUALITY))
+            for rows, ratio in zip((slice(3), slice(3, 6)), ANEW["each"], strict=True):
+                out.append(Scatter(partial(_pose_noise, arm, rows), ratio * accuracy, QUALITY))
     return out
 
 
@@ -142,86 +129,59 @@ def joints_known(carrier: Carrier) -> bool:
     return carrier.joints is not None and carrier.kinematics is not None
 
 
-def _of_joints(arm: str) -> Callable[[Problem, Linear], Floats]:
-    def covariances(problem: Problem, linear: Linear) -> Floats:
-        moves = _of_carriers(arm, "zeros")(problem, linear)
-        return np.asarray(moves @ np.swapaxes(moves, 1, 2))
-
-    return covariances
+def _joint_noise(arm: str, problem: Problem, linear: Linear) -> Floats:
+    moves = _moved(arm, partial(_displaced, "zeros"), problem, linear)
+    return np.asarray(moves @ np.swapaxes(moves, 1, 2))
 
 
-def _pose_noise(arm: str, rows: slice) -> Callable[[Problem, Linear], Floats]:
-    """Return a function: covariances of sightings for unit noise of an arm's poses in ``rows``."""
-
-    def covariances(problem: Problem, linear: Linear) -> Floats:
-        moved = [linear.blocks[c.frame][:, :, rows] for c in problem.carriers if c.arm == arm]
-        return np.asarray(sum(moves @ np.swapaxes(moves, 1, 2) for moves in moved))
-
-    return covariances
+def _pose_noise(arm: str, rows: slice, problem: Problem, linear: Linear) -> Floats:
+    """Return the covariances of sightings for unit noise of an arm's poses in ``rows``."""
+    moved = [linear.blocks[c.frame][:, :, rows] for c in problem.carriers if c.arm == arm]
+    return np.asarray(sum(moves @ np.swapaxes(moves, 1, 2) for moves in moved))
 
 
-def _of_carriers(arm: str, kind: str) -> Block:
-    """Return the design block of the twists (T, 6, K) of one arm's carriers."""
-
-    def block(problem: Problem, linear: Linear) -> Floats:
-        moved = [c for c in problem.carriers if c.arm == arm]
-        parts = [linear.blocks[c.frame] @ displacements(c)[kind][problem.seen.times] for c in moved]
-        return np.asarray(sum(parts))
-
-    return block
+def _moved(
+    arm: str, twists: Callable[[Problem, Carrier], Floats], problem: Problem, linear: Linear
+) -> Floats:
+    """Return the design block of the ``twists`` (N, 6, K) of an arm's carriers."""
+    moved = [c for c in problem.carriers if c.arm == arm]
+    return np.asarray(sum(linear.blocks[c.frame] @ twists(problem, c) for c in moved))
 
 
-def _in_common(arm: str, at_base: bool, rows: slice) -> Block:
-    """Return the design block of a turn or shift common to all poses, at the base or the flange."""
-
-    def block(problem: Problem, linear: Linear) -> Floats:
-        out = np.zeros((len(problem.seen), 6, 3))
-        for c in (c for c in problem.carriers if c.arm == arm):
-            poses = np.asarray(problem.frames[c.frame].place)[problem.seen.times]
-            motions = np.tile(np.eye(6), (len(poses), 1, 1))
-            if at_base:
-                motions[:, 3:, :3] = -hat(poses[:, :3, 3])
-            else:
-                motions[:, :3, :3] = motions[:, 3:, 3:] = poses[:, :3, :3]
-            out += linear.blocks[c.frame] @ motions[:, :, rows]
-        return out
-
-    return block
+def _displaced(kind: str, problem: Problem, carrier: Carrier) -> Floats:
+    return np.asarray(displacements(carrier)[kind][problem.seen.times])
 
 
-def _bent(arm: str, session: Floats) -> Block:
-    """Return the design block of an error that is linear in the pose, about a session's mean."""
+def _in_common(at_base: bool, rows: slice, problem: Problem, carrier: Carrier) -> Floats:
+    """Return twists of a turn or shift common to all poses, at the base or the flange."""
+    poses = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times]
+    motions = np.tile(np.eye(6), (len(poses), 1, 1))
+    if at_base:
+        motions[:, 3:, :3] = -hat(poses[:, :3, 3])
+    else:
+        motions[:, :3, :3] = motions[:, 3:, 3:] = poses[:, :3, :3]
+    return motions[:, :, rows]
+
+
+def _linear_in_pose(session: Floats, problem: Problem, carrier: Carrier) -> Floats:
+    """Return twists (N, 6, 36) that are linear in the pose, about a session's mean."""
     middle, turned = session[:, :3, 3].mean(axis=0), session[:, :3, :3].mean(axis=0)
-    changes = [ANEW["rotation"], ANEW["translation"]]
-
-    def block(problem: Problem, linear: Linear) -> Floats:
-        out = np.zeros((len(problem.seen), 6, 36))
-        for c in (c for c in problem.carriers if c.arm == arm):
-            poses = np.asarray(problem.frames[c.frame].place)[problem.seen.times]
-            turns = skew_parts(poses[:, :3, :3] @ turned.T)
-            by = np.stack([poses[:, :3, 3] - middle, turns], axis=1)
-            # Each of the twist's six numbers by the six of the pose
-            sizes = np.repeat(changes, 3, axis=0)[:, :, None] * by[:, None]
-            rows = np.eye(6)[:, :, None] * sizes.reshape(len(by), 1, 6, 6)
-            out += linear.blocks[c.frame] @ rows.reshape(len(by), 6, 36)
-        return out
-
-    return block
+    poses = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times]
+    by = np.stack([poses[:, :3, 3] - middle, skew_parts(poses[:, :3, :3] @ turned.T)], axis=1)
+    # Each of the twist's six numbers by the six of the pose
+    changes = np.repeat([ANEW["rotation"], ANEW["translation"]], 3, axis=0)
+    sizes = changes[:, :, None] * by[:, None]
+    rows = np.eye(6)[:, :, None] * sizes.reshape(len(by), 1, 6, 6)
+    return rows.reshape(len(by), 6, 36)
 
 
-def _by_place(arm: str, field: SmoothField) -> Block:
+def _by_place(arm: str, field: SmoothField, problem: Problem, linear: Linear) -> Floats:
     """Return the design block of a displacement that is smooth in the reported position."""
-
-    def block(problem: Problem, linear: Linear) -> Floats:
-        moved = [c for c in problem.carriers if c.arm == arm]
-        return np.asarray(sum(_field_block(problem, linear, c.frame, field) for c in moved))
-
-    return block
-
-
-def _field_block(problem: Problem, linear: Linear, frame: str, field: SmoothField) -> Floats:
-    places = np.asarray(problem.frames[frame].place)[problem.seen.times, :3, 3]
-    return linear.blocks[frame][:, :, 3:] @ field_effects(field, places)
+    parts = []
+    for frame in (c.frame for c in problem.carriers if c.arm == arm):
+        places = np.asarray(problem.frames[frame].place)[problem.seen.times, :3, 3]
+        parts.append(linear.blocks[frame][:, :, 3:] @ field_effects(field, places))
+    return np.asarray(sum(parts))
 
 
 @lru_cache(maxsize=16)

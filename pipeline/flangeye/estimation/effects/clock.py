@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Linear, Problem
 from flangeye.maths.streams import joints_at, later, pose_at
 from flangeye.models.cell import Cell
@@ -18,26 +19,23 @@ def clock_effects(problem: Problem) -> list[Effect]:
     """Return the effect of each camera's delay [s] behind the poses."""
     if not problem.carriers or any(c.rates is None for c in problem.carriers):
         return []
-    cameras = list(dict.fromkeys(camera for camera, _ in problem.ends))
+    # Two clocks that were not synchronised [s]: an exposure, a buffer, a network's delay; four
+    # times as much or as little, one sigma
+    size, factor = 20e-3, 4.0
     return [
-        # Two clocks that were not synchronised [s]: an exposure, a buffer, a network's delay; four
-        # times as much or as little, one sigma
-        Effect(f"clock of {camera}", _delay(camera), 20e-3, 4.0, kind="clock", lasting=False)
-        for camera in cameras
+        Effect(f"clock of {c}", partial(_delay, c), size, factor, kind="clock", lasting=False)
+        for c in dict.fromkeys(camera for camera, _ in problem.ends)
     ]
 
 
-def _delay(camera: str) -> Block:
-    def block(problem: Problem, linear: Linear) -> Floats:
-        s, out = problem.seen, np.zeros((len(problem.seen), 6))
-        for carrier in problem.carriers:
-            if carrier.rates is not None:
-                turned = linear.blocks[carrier.frame] @ carrier.rates[s.times][..., None]
-                out += turned[..., 0]
-        whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
-        return np.asarray(np.where(whose[:, None], out, 0.0)[..., None])
-
-    return block
+def _delay(camera: str, problem: Problem, linear: Linear) -> Floats:
+    s, out = problem.seen, np.zeros((len(problem.seen), 6))
+    for carrier in problem.carriers:
+        if carrier.rates is not None:
+            turned = linear.blocks[carrier.frame] @ carrier.rates[s.times][..., None]
+            out += turned[..., 0]
+    whose = np.array([problem.ends[k][0] == camera for k in s.pairs])
+    return np.asarray(np.where(whose[:, None], out, 0.0)[..., None])
 
 
 def delayed(

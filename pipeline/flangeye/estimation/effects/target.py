@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from flangeye.estimation.effects.effect import Block, Effect
+from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.graph import Linear, Places, Problem
 from flangeye.types import Floats
 
@@ -24,11 +25,11 @@ def target_effects(problem: Problem) -> list[Effect]:
     if (ranks == 5).any():
         # Of a plate's face against the flange's axis [rad]: flatness of 0.02 mm over the
         # rim and what the last joint's bearing adds
-        effects.append(Effect("tilt of the face", _tilt(circles), 0.5e-3, kind="tilt"))
+        effects.append(Effect("tilt of the face", partial(_tilt, circles), 0.5e-3, kind="tilt"))
     if (ranks > 0).any():
         effects.append(
             # Of the seen circle's centre from the controller's flange origin [m]
-            Effect("offset of the circle", _offset(circles), 0.03e-3, kind="offset")
+            Effect("offset of the circle", partial(_offset, circles), 0.03e-3, kind="offset")
         )
     return effects
 
@@ -63,21 +64,15 @@ def offset_shown_to(problem: Problem, places: Places) -> float:
     return error / float(np.sqrt(max(np.linalg.eigvalsh(shown)[0], 1e-12))) if error < 5e-3 else 0.0
 
 
-def _tilt(circles: list[int]) -> Block:
-    def block(problem: Problem, linear: Linear) -> Floats:
-        out = np.zeros((len(problem.seen), 6, 2))
-        rows = np.isin(problem.seen.pairs, circles) & (problem.seen.ranks == 5)
-        out[rows, :3] = linear.turns[rows][:, :, :2]
-        return out
-
-    return block
+def _tilt(circles: list[int], problem: Problem, linear: Linear) -> Floats:
+    out = np.zeros((len(problem.seen), 6, 2))
+    rows = np.isin(problem.seen.pairs, circles) & (problem.seen.ranks == 5)
+    out[rows, :3] = linear.turns[rows][:, :, :2]
+    return out
 
 
-def _offset(circles: list[int]) -> Block:
-    def block(problem: Problem, linear: Linear) -> Floats:
-        out = np.zeros((len(problem.seen), 6, 3))
-        rows = np.isin(problem.seen.pairs, circles)
-        out[rows, 3:] = linear.turns[rows]
-        return out
-
-    return block
+def _offset(circles: list[int], problem: Problem, linear: Linear) -> Floats:
+    out = np.zeros((len(problem.seen), 6, 3))
+    rows = np.isin(problem.seen.pairs, circles)
+    out[rows, 3:] = linear.turns[rows]
+    return out
