@@ -85,7 +85,7 @@ def test_leaving_a_fold_out_is_fitting_the_others_at_the_same_sizes(sightings) -
     posterior = estimated(session, "marker").posterior
     shares = posterior.model.shares.copy()
     shares[fold] = 0.0
-    others = posterior.model.weighted(shares)
+    others = replace(posterior.model, shares=shares)
     assert posterior.without(fold).model.shares.tolist() == shares.tolist()
     for known, left in zip(posterior.fits, posterior.without(fold).fits, strict=True):
         again = fit(others, known.sizes)

@@ -56,6 +56,11 @@ class Estimate:
         """The fit at the most likely standard deviations of effects and noise."""
         return self.posterior.mode
 
+    @property
+    def errors(self) -> Floats:
+        """Leave-one-out residuals (N, 6) of each sighting [rad, m]."""
+        return left_out(self.posterior.model, self.fit)[0]
+
     def numbers(self, kind: str) -> list[tuple[Effect, Floats, Floats]]:
         """Return the effects of one kind, each with the mean and covariance of its parameters."""
         known = self.posterior
@@ -184,10 +189,9 @@ def _parts(seen: Sightings) -> Floats:
     Circles and centres are fitted to points in space, and their covariances know the line of sight;
     a whole pose needs sizes of its own along it.
     """
-    whole, both = seen.ranks == 6, np.kron(np.eye(2)[:, :, None] * np.eye(2), np.eye(3))
-    every = np.repeat(both[:, None], len(seen), axis=1)
+    whole, every = seen.ranks == 6, _further(len(seen))
     if not whole.any():
-        return np.asarray(every)
+        return every
     far = np.linalg.norm(seen.centres, axis=1)[:, None]
     ray = np.where(far > 0, seen.centres, [0.0, 0.0, 1.0]) / np.where(far > 0, far, 1.0)
     along = np.kron(np.eye(2), np.ones((3, 3))) * np.tile(ray[:, :, None] * ray[:, None], (1, 2, 2))

@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Frame, chain, composed
 from flangeye.types import Floats, Indices, Mask
-from flangeye.types.geometry import hat, invert, rotation_between, rotation_exp, rotation_log
+from flangeye.types.geometry import (
+    each_applied,
+    hat,
+    invert,
+    rotation_between,
+    rotation_exp,
+    rotation_log,
+)
 
 Places = Mapping[str, Floats]
 """(4, 4) parent_T_frame of each unknown frame."""
@@ -169,15 +176,19 @@ class Problem:
         frames = {n: replace(f, place=places.get(n, f.place)) for n, f in self.frames.items()}
         return replace(self, frames=frames)
 
+    def predicted(self, places: Places) -> Floats:
+        """Return the predicted poses (N, 4, 4) ``camera_T_target``."""
+        out = np.zeros((len(self.seen), 4, 4))
+        for k, (camera, target) in enumerate(self.ends):
+            rows = self.seen.pairs == k
+            frames = self.frames_at(places, self.seen.times[rows])
+            out[rows] = invert(composed(frames, camera)) @ composed(frames, target)
+        return out
+
     def residuals(self, places: Places) -> Floats:
         """Return (N, 6) measured minus predicted, zero in unmeasured directions [rad, m]."""
-        s, out = self.seen, np.zeros((len(self.seen), 6))
-        for k, ends in enumerate(self.ends):
-            rows = s.pairs == k
-            if rows.any():
-                frames = self._at(places, s.times[rows])
-                out[rows] = _residuals(frames, ends, s.where(rows))[0]
-        return np.asarray((s.projectors @ out[..., None])[..., 0])
+        left = _residuals(self.predicted(places), self.seen)
+        return np.asarray((self.seen.projectors @ left[..., None])[..., 0])
 
     def moved(self, places: Places, step: Floats) -> Places:
         """Return the places moved by (6 K,), in the order of ``unknown``."""
@@ -202,16 +213,15 @@ class Problem:
     def linearised(self, places: Places) -> Linear:
         """Return the sightings predicted at some places, with their derivatives by each frame."""
         s, moved = self.seen, [*self.unknown, *self.moving]
-        residuals, turns = np.zeros((len(s), 6)), np.zeros((len(s), 3, 3))
+        predicted = self.predicted(places)
         blocks = {name: np.zeros((len(s), 6, 6)) for name in moved}
         for k, ends in enumerate(self.ends):
             rows = s.pairs == k
             if rows.any():
-                frames = self._at(places, s.times[rows])
-                residuals[rows], turns[rows] = _residuals(frames, ends, s.where(rows))
+                frames = self.frames_at(places, s.times[rows])
                 for name, block in _blocks(frames, ends, s.offsets[rows], moved).items():
                     blocks[name][rows] = block
-        return Linear(residuals, turns, blocks)
+        return Linear(_residuals(predicted, s), predicted[:, :3, :3], blocks)
 
     def following(self, carrier: Carrier) -> Linear:
         """Return the linearisation by the twists (N, 6) of one carrier's frame, all else fixed."""
@@ -219,8 +229,8 @@ class Problem:
         blocks = {c.frame: eye * (c is carrier) for c in self.carriers}
         return Linear(np.zeros(0), np.zeros(0), blocks)
 
-    def _at(self, places: Places, times: Indices) -> dict[str, Frame]:
-        """Return the frames at some times, all places known."""
+    def frames_at(self, places: Places, times: Indices | int) -> dict[str, Frame]:
+        """Return the frames at some times or at one, all places known."""
         out = {}
         for name, frame in self.frames.items():
             place = np.asarray(places[name] if frame.place is None else frame.place)
@@ -243,18 +253,14 @@ class Linear:
     blocks: Mapping[str, Floats] = field(default_factory=dict)
 
 
-def _residuals(
-    frames: Mapping[str, Frame], ends: tuple[str, str], s: Sightings
-) -> tuple[Floats, Floats]:
-    camera, target = (composed(frames, end) for end in ends)
-    predicted = np.broadcast_to(invert(camera) @ target, (len(s), 4, 4))
+def _residuals(predicted: Floats, s: Sightings) -> Floats:
     rotations = predicted[:, :3, :3]
-    centres = (rotations @ s.offsets[..., None])[..., 0] + predicted[:, :3, 3]
+    centres = each_applied(predicted, s.offsets)
     # A circle's rotation about its axis was not measured: the shortest turn between the axes
     turns = rotation_between(rotations[:, :, 2], s.rotations[:, :, 2])
     whole = s.ranks == 6
     turns[whole] = rotation_log(s.rotations[whole] @ np.swapaxes(rotations[whole], 1, 2))
-    return np.concatenate([turns, s.centres - centres], axis=1), np.asarray(rotations)
+    return np.concatenate([turns, s.centres - centres], axis=1)
 
 
 def _blocks(

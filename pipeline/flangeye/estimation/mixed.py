@@ -108,10 +108,6 @@ class LinearModel:
             return self
         return self.where(kept[np.linspace(0, len(kept) - 1, TELLING).round().astype(int)])
 
-    def weighted(self, shares: Floats) -> LinearModel:
-        """Return the model with other weights of its sightings."""
-        return replace(self, shares=shares)
-
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -314,7 +310,7 @@ class Posterior:
         shares, taken = self.model.shares.copy(), self.model.where(rows)
         shares[rows] = 0.0
         mode, *fits = _without(taken, [self.mode, *self.fits])
-        left = self.model.weighted(shares)
+        left = replace(self.model, shares=shares)
         return replace(self, model=left, mode=mode, draw=lambda: fits)
 
     def refitted(self, model: LinearModel) -> Posterior:

@@ -234,25 +234,20 @@ def _meaningful(problem: Problem, places: Places) -> Floats:
 
 
 def _of_what(problem: Problem, weak: Floats) -> str:
-    names = {name: _called(problem, name) for name in problem.unknown}
     shares = {
         (name, kind): float(np.linalg.norm(weak[6 * i + at : 6 * i + at + 3]))
         for i, name in enumerate(problem.unknown)
         for at, kind in ((0, "rotation"), (3, "translation"))
     }
-    camera = problem.ends[0][0]
+    camera, target = problem.ends[0]
     of_camera = [
         kind for (name, kind), size in shares.items() if size > UNKNOWN_SHARE and name == camera
     ]
     named = camera if of_camera else max(shares, key=lambda key: shares[key])[0]
     what = " and ".join(of_camera) if of_camera else "part"
-    return f"{what} of {names[named]} is not observable from these poses"
-
-
-def _called(problem: Problem, name: str) -> str:
-    camera, target = problem.ends[0]
-    known = {camera: "the camera's pose", target: "the target's place"}
-    return known.get(name, "the second base's pose")
+    names = {camera: "the camera's pose", target: "the target's place"}
+    whose = names.get(named, "the second base's pose")
+    return f"{what} of {whose} is not observable from these poses"
 
 
 def _missing_motion(problem: Problem, places: Places) -> tuple[str, str]:

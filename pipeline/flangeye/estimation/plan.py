@@ -13,20 +13,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from flangeye.errors import FlangeyeError
-from flangeye.estimation.effects.effect import Effect
 from flangeye.estimation.estimate import Estimate, judged, model_at
 from flangeye.estimation.graph import Places, Problem
-from flangeye.estimation.mixed import Fit, LinearModel, fit, left_out, marginal
+from flangeye.estimation.mixed import Posterior, fit, marginal
 from flangeye.estimation.observability import unobservable
 from flangeye.estimation.session.session import ModelOptions, effects_of
 from flangeye.estimation.start.loops import agreeing, initial_guess
 from flangeye.estimation.start.sightings import problem_of
-from flangeye.maths.statistics import largest_error_quantile
+from flangeye.maths.statistics import corners_of, largest_error_quantile
 from flangeye.maths.threads import on_one_thread
 from flangeye.models.cell import Cell, composed
 from flangeye.types import (
@@ -35,7 +34,6 @@ from flangeye.types import (
     Feature,
     Floats,
     Indices,
-    Mask,
     Observation,
     PoseFeature,
     Transform,
@@ -43,42 +41,16 @@ from flangeye.types import (
 from flangeye.types.geometry import hat, invert, stack_rows
 
 
-@dataclass(frozen=True, eq=False)
-class Preview:
-    """A quick estimate with all sizes at their prior medians, for planning and diagnosis.
-
-    Attributes:
-        problem: The estimation problem.
-        places: Pose (4, 4) of each unknown.
-        effects: The possible errors.
-        model: The linear model at the places.
-        fit: The fit of that model.
-        inliers: (N,) which sightings agree.
-    """
-
-    problem: Problem
-    places: Places
-    effects: Sequence[Effect]
-    model: LinearModel
-    fit: Fit
-    inliers: Mask
-
-    @property
-    def errors(self) -> Floats:
-        """Leave-one-out residuals (N, 6) of each sighting [rad, m]."""
-        return left_out(self.model, self.fit)[0]
-
-    @property
-    def covariance(self) -> Floats:
-        """Covariance (P, P) of the places."""
-        return self.fit.covariance[: self.model.p, : self.model.p]
-
-
 @on_one_thread
 def preview(
     problem: Problem, freedoms: Mapping[str, Floats] | None = None, search: bool = True
-) -> Preview:
-    """Return a quick estimate; see :func:`initial_guess` for ``search``.
+) -> Estimate:
+    """Return a quick estimate with all sizes at their prior medians, for planning and diagnosis.
+
+    Args:
+        problem: The sightings.
+        freedoms: (6, k) unit twists of the possible motions, by frame.
+        search: As of :func:`initial_guess`.
 
     Raises:
         CalibrationRefused: No initial guess is found, or the sightings leave an unknown
@@ -91,44 +63,39 @@ def preview(
         model = model_at(problem, places, effects, agree.astype(float))
         found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])))
         places = problem.moved(places, found.mean[: model.p])
-        agree = judged(model, found)[1] & agree
-    known = marginal(model, found.sizes)
-    # Largest standard deviations [rad, m] of what is known
-    unobservable(
-        problem.where(agree), places, known, (float(np.radians(2)), 20e-3), False, freedoms
-    )
-    return Preview(problem, places, effects, model, found, agree)
+        squares, good = judged(model, found)
+        agree &= good
+    # Largest standard deviations of what is known [rad, m]
+    limits = float(np.radians(2)), 20e-3
+    information = marginal(model, found.sizes)
+    unobservable(problem.where(agree), places, information, limits, False, freedoms)
+    known = Posterior(model, found, lambda: [found], found.cost)
+    return Estimate(problem, effects, places, known, agree, squares)
 
 
-def estimate_so_far(observations: Sequence[Observation], cell: Cell) -> Preview | None:
+def estimate_so_far(observations: Sequence[Observation], cell: Cell) -> Estimate | None:
     """Return the estimate from the sightings so far; None while an unknown is unobservable."""
     with suppress(FlangeyeError, np.linalg.LinAlgError):
         return preview(problem_of(observations, cell), cell.freedoms)
     return None
 
 
-def errors_at_work(found: Preview, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
+def errors_at_work(found: Estimate, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
     """Return each unknown frame's 95 % bound of the error at its work [m]."""
-    work = work_of_frames(found, cell, seen)
-    return {
-        name: largest_error_quantile(covariance, found.places[name][:3, 3], points)
-        for (name, points), covariance in zip(work.items(), _blocks(found), strict=True)
-    }
+    out, work = {}, work_of_frames(found, cell, seen)
+    for i, (name, points) in enumerate(work.items()):
+        own = found.fit.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        out[name] = largest_error_quantile(own, found.places[name][:3, 3], points)
+    return out
 
 
-def _blocks(found: Preview) -> list[Floats]:
-    """Return the (6, 6) covariance of each place."""
-    covariance = found.covariance
-    return [covariance[i : i + 6, i : i + 6] for i in range(0, len(covariance), 6)]
-
-
-def work_of_frames(found: Preview, cell: Cell, seen: Sequence[Observation]) -> Mapping[str, Floats]:
+def work_of_frames(found: Estimate, cell: Cell, seen: Sequence[Observation]) -> dict[str, Floats]:
     """Return points (k, 3) at which each unknown frame must be accurate, in its parent [m].
 
     The points of a camera are where it saw targets; those of other frames are about the origin.
     """
     # About the origin of what is not a camera, errors count so far off [m]
-    corners = 0.1 * np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    corners = corners_of(np.zeros(3), np.full(3, 0.2))
     work = {}
     for name, place in found.places.items():
         points = np.array([o.feature.centre for o in seen if o.camera == name]).reshape(-1, 3)
@@ -167,7 +134,7 @@ def most_informative(
 
 
 def best_next(
-    candidates: Sequence[Observation], found: Preview, cell: Cell, seen: Sequence[Observation]
+    candidates: Sequence[Observation], found: Estimate, cell: Cell, seen: Sequence[Observation]
 ) -> int:
     """Return the candidate that is expected to reduce the error at the work most.
 
@@ -221,7 +188,7 @@ def _moved(like: Feature, pose: Floats) -> Feature:
 
 
 def whitened(
-    sightings: Sequence[Observation], found: Preview | Estimate, cell: Cell
+    sightings: Sequence[Observation], found: Estimate, cell: Cell
 ) -> tuple[Floats, Floats]:
     """Return the whitened (M, 6, P + K) rows of sightings and their (M, 6) errors."""
     problem = problem_of(sightings, cell)
@@ -232,7 +199,7 @@ def whitened(
     return roots @ model.design, (roots @ model.residuals[..., None])[..., 0]
 
 
-def _levers(found: Preview, cell: Cell, seen: Sequence[Observation]) -> Floats:
+def _levers(found: Estimate, cell: Cell, seen: Sequence[Observation]) -> Floats:
     """Return (A, P + K) equally weighted derivatives of all frames' work points."""
     blocks, work = [], work_of_frames(found, cell, seen)
     for i, (name, points) in enumerate(work.items()):

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from flangeye.errors import StageError
-from flangeye.estimation.plan import Preview, best_next, estimate_so_far, predict, predicted_poses
+from flangeye.estimation.estimate import Estimate
+from flangeye.estimation.plan import best_next, estimate_so_far, predict, predicted_poses
 from flangeye.maths.kinematics import Arm
 from flangeye.models.cell import Axis, Cell, chain
 from flangeye.plugin.stage import PlaceParams
@@ -87,7 +88,7 @@ class NextBest:
         self._planned, self._left = planned, list(planned.scheduled)
         self._rng = np.random.default_rng(len(planned.scheduled))
         self._taken: set[int] = set()
-        self._found: Preview | None = None
+        self._found: Estimate | None = None
 
     def sightings(self, seen: Callable[[], Sequence[Observation]]) -> Iterator[Sighting]:
         """Yield at most as many sightings as were scheduled."""
@@ -112,7 +113,7 @@ class NextBest:
         best = expected[best_next(expected, self._found, cell, seen)]
         return int(best.id), best.camera, best.target
 
-    def _in_view(self, like: Observation, found: Preview) -> list[Observation]:
+    def _in_view(self, like: Observation, found: Estimate) -> list[Observation]:
         """Return predicted observations of a target by a camera that sees it, at random moments."""
         moments = self._planned.moments
         # Moments that are compared for each camera and target

@@ -181,12 +181,10 @@ class _Commands:
         """Rotation and shift (B, 6, K) of the root's reported coordinates."""
         parts = []
         for carrier in self.work.carriers:
-            path = chain(self.work.frames, carrier.frame)[:-1]
-            places = [np.asarray(self.work.frames[n].place) for n in path]
-            if carrier.link is None and all(place.shape == (4, 4) for place in places):
-                base = np.eye(4)
-                for place in places:
-                    base = base @ place
+            parent = self.work.frames[carrier.frame].parent
+            path = [self.work.frames[name].place for name in chain(self.work.frames, parent)]
+            if carrier.link is None and all(p is not None and p.ndim == 2 for p in path):
+                base = composed(self.work.frames, parent)
                 parts.append(adjoint(base) @ self._rigid_parts[carrier.frame])
         # Arms that disagree about the root share it: its reported coordinates are their mean's
         count = self._of_arm.shape[2]
@@ -197,11 +195,7 @@ class _Commands:
     def _fixed(self, name: str, world: Floats) -> Floats:
         """Return the (B, 6, K) rigid part of a place that no arm moves, about its own origin."""
         known, work = self.found.places, self.work
-        frames = {n: replace(f, place=known.get(n, f.place)) for n, f in work.frames.items()}
-        parent = np.eye(4)
-        for each in chain(frames, name)[:-1]:
-            place = np.asarray(frames[each].place)
-            parent = parent @ (place if place.ndim == 2 else place[0])
+        parent = composed(work.frames_at(known, 0), work.frames[name].parent)
         gauge, place = -world, parent @ known[name]
         for carrier in work.carriers:
             if work.frames[carrier.frame].parent == name and carrier.link is None:
@@ -227,11 +221,8 @@ class _Commands:
         fixed, so the camera's pose takes up b; with a fixed camera the target's pose in the hand
         does.
         """
-        work, frames = self.work, {}
-        for each, frame in work.frames.items():
-            place = np.asarray(self.found.places.get(each, frame.place))
-            at = place if place.ndim == 2 else place[work.seen.times]
-            frames[each] = replace(frame, place=at)
+        work = self.work
+        frames = work.frames_at(self.found.places, work.seen.times)
         out = np.zeros((len(work.seen), 6, 6))
         for k, (camera, target) in enumerate(work.ends):
             rows = np.flatnonzero(work.seen.pairs == k)

@@ -12,9 +12,8 @@ from flangeye.estimation.effects.arm import joints_known, kinematics_and_joints
 from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import spread_evenly
-from flangeye.models.cell import composed
 from flangeye.types import Box, Floats, Indices
-from flangeye.types.geometry import invert, skew_parts
+from flangeye.types.geometry import each_applied, skew_parts
 
 COUNT = 256
 """Number of simulated poses; twice as many change the expected error by less than a tenth."""
@@ -160,19 +159,7 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
 def _predicted(problem: Problem, places: Places) -> Sightings:
     """Return a problem's predicted sightings, each with its noise rotated accordingly."""
     s, count = problem.seen, len(problem.seen)
-    frames = {
-        name: replace(frame, place=np.asarray(places.get(name, frame.place)))
-        for name, frame in problem.frames.items()
-    }
-    frames = {
-        n: replace(f, place=f.place[s.times]) if f.place is not None and f.place.ndim == 3 else f
-        for n, f in frames.items()
-    }
-    out = np.zeros((count, 4, 4))
-    for k, (camera, target) in enumerate(problem.ends):
-        rows = s.pairs == k
-        seen = invert(composed(frames, camera)) @ composed(frames, target)
-        out[rows] = np.broadcast_to(seen, (count, 4, 4))[rows]
+    out = problem.predicted(places)
     rotations, ranks = out[:, :3, :3], s.ranks
     normals, projectors = rotations[:, :, 2], s.projectors.copy()
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
@@ -185,7 +172,7 @@ def _predicted(problem: Problem, places: Places) -> Sightings:
     return replace(
         s,
         rotations=rotations,
-        centres=(rotations @ s.offsets[..., None])[..., 0] + out[:, :3, 3],
+        centres=each_applied(out, s.offsets),
         covariances=projectors @ both @ s.covariances @ np.swapaxes(both, 1, 2) @ projectors,
         projectors=projectors,
     )

@@ -172,7 +172,7 @@ def _linear_in_pose(session: Floats, problem: Problem, carrier: Carrier) -> Floa
     changes = np.repeat([ANEW["rotation"], ANEW["translation"]], 3, axis=0)
     sizes = changes[:, :, None] * by[:, None]
     rows = np.eye(6)[:, :, None] * sizes.reshape(len(by), 1, 6, 6)
-    return rows.reshape(len(by), 6, 36)
+    return np.asarray(rows.reshape(len(by), 6, 36))
 
 
 def _by_place(arm: str, field: SmoothField, problem: Problem, linear: Linear) -> Floats:

@@ -56,6 +56,10 @@ class Pairs(NamedTuple):
     marker: Floats
     in_hand: bool
 
+    def where(self, kept: Mask) -> Pairs:
+        """Return some of the poses."""
+        return Pairs(self.robot[kept], self.marker[kept], self.in_hand)
+
 
 class Reading(NamedTuple):
     """Changes to apply to poses as they were read, in this order."""
@@ -176,22 +180,17 @@ def _costs(readings: list[Reading], pairs: Pairs, robot: RobotModel | None) -> F
     """
     some = np.unique(np.linspace(0, len(pairs.robot) - 1, 60).round().astype(int))
     kept = np.isin(np.arange(len(pairs.robot)), some)
-    found = [_estimated(each.of(pairs), kept, robot) for each in readings]
+    found = [estimated(each.of(pairs).where(kept), robot) for each in readings]
     agree = np.all([each.inliers for each in found if each], axis=0)
     if any(found) and not agree.all():
         kept[np.flatnonzero(kept)[~agree]] = False
-        found = [_estimated(each.of(pairs), kept, robot) for each in readings]
+        found = [estimated(each.of(pairs).where(kept), robot) for each in readings]
     costs = [0.5 * each.posterior.cost if each else np.inf for each in found]
     left = [each.problem.residuals(each.places)[each.inliers] for each in found if each]
     # Exact poses, to a micrometre, have no noise to tell by: the priors alone would decide
     if left and max(np.abs(each).max(initial=0.0) for each in left) < 1e-6:
         costs = [0.0 if each else np.inf for each in found]
     return np.zeros(len(costs)) if np.isinf(costs).all() else np.array(costs)
-
-
-def _estimated(pairs: Pairs, kept: Mask, robot: RobotModel | None) -> Estimate | None:
-    some = Pairs(pairs.robot[kept], pairs.marker[kept], pairs.in_hand)
-    return estimated(some, robot)
 
 
 def estimated(pairs: Pairs, robot: RobotModel | None) -> Estimate | None:

@@ -137,7 +137,9 @@ def session_of(
     found = estimate(problem, places, effects, agree)
     session = Session(observations, cell, scanner, asked, found, (*notes, *branch_notes))
     session = _with_walk(_with_bad_normals_left_out(session))
-    _require_majority(session.found)
+    agreed, given = int(session.found.inliers.sum()), len(observations)
+    if agreed < max(3, given / 2):
+        raise CalibrationRefused(f"only {agreed} of {given} poses fit one calibration", CONFIGURED)
     return _with_offset(_with_size(_on_one_clock(session), factor))
 
 
@@ -194,8 +196,16 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
 
 def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
     """Refuse sightings that agree no better than scans paired with wrong poses."""
-    shift, turn = _spread(problem, places, agree)
-    if _plausible(problem, shift, turn):
+    r, s = problem.residuals(places)[agree], problem.seen
+    # Of the agreeing sightings [m] and [rad], rms
+    shift, turn = (
+        float(np.sqrt((r[:, at] ** 2).sum(axis=1).mean())) for at in (slice(3, 6), slice(3))
+    )
+    extent = float(np.sqrt(s.centres.var(axis=0).sum()))
+    axes = s.rotations[s.ranks >= 5, :, 2]
+    turned = float(np.sqrt(axes.var(axis=0).sum())) if len(axes) else 0.0
+    # Scans that belong to other poses show noise as large as their extent.
+    if shift < max(0.02, 0.4 * extent) and turn < max(np.radians(5.0), 0.4 * turned):
         return
     if len(problem.ends) == 1:
         _require_right_handed(problem, places)
@@ -212,22 +222,6 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
         "check that each sighting belongs to the poses in its row (join: clock_offset, if "
         f"{camera} has another clock), and that the cell is set up as the recipe states",
     )
-
-
-def _spread(problem: Problem, places: Places, agree: Mask) -> tuple[float, float]:
-    """Return the rms residuals of the agreeing sightings [m] and [rad]."""
-    r = problem.residuals(places)[agree]
-    shift, turn = (np.sqrt((r[:, at] ** 2).sum(axis=1).mean()) for at in (slice(3, 6), slice(3)))
-    return float(shift), float(turn)
-
-
-def _plausible(problem: Problem, shift: float, turn: float) -> bool:
-    s = problem.seen
-    extent = float(np.sqrt(s.centres.var(axis=0).sum()))
-    axes = s.rotations[s.ranks >= 5, :, 2]
-    turned = float(np.sqrt(axes.var(axis=0).sum())) if len(axes) else 0.0
-    # Scans that belong to other poses show noise as large as their extent.
-    return shift < max(0.02, 0.4 * extent) and turn < max(np.radians(5.0), 0.4 * turned)
 
 
 def _require_right_handed(problem: Problem, places: Places) -> None:
@@ -254,15 +248,6 @@ def _require_right_handed(problem: Problem, places: Places) -> None:
             "what the camera saw fits the poses only when mirrored "
             f"({np.sqrt(theirs) * 1e3:.1f} mm instead of {np.sqrt(ours) * 1e3:.1f} mm)",
             "flip one axis of the scanner's or the robot's frame",
-        )
-
-
-def _require_majority(found: Estimate) -> None:
-    agree, given = int(found.inliers.sum()), len(found.inliers)
-    if agree < max(3, given / 2):
-        raise CalibrationRefused(
-            f"only {agree} of {given} poses fit one calibration",
-            CONFIGURED,
         )
 
 
@@ -516,15 +501,6 @@ def _size_far_off(session: Session) -> float | None:
     return factor if better > chi2_quantile(1 - MISFIT, 1) else None
 
 
-def _unseen_tool(known: float) -> Warn:
-    told = f"known to {known * 1e3:.0f} mm only" if known < 1 else "not known at all"
-    return Warn(
-        "the poses hardly turn the flange, so a tool set in the controller would not show: an "
-        f"offset of the flange from the reported poses is {told}",
-        "check that the controller's tool is zero, or add poses turned by 20 deg about two axes",
-    )
-
-
 def _with_offset(session: Session) -> Session:
     """Return the session with the circle's estimated offset, if it contradicts the configuration.
 
@@ -538,7 +514,17 @@ def _with_offset(session: Session) -> Session:
     if not found.outgrown("offset"):
         known = offset_shown_to(found.problem.where(found.inliers), found.places)
         # The shortest tools are five times as long [m]
-        return session.noted(_unseen_tool(known)) if known > 0.01 else session
+        if known <= 0.01:
+            return session
+        told = f"known to {known * 1e3:.0f} mm only" if known < 1 else "not known at all"
+        return session.noted(
+            Warn(
+                "the poses hardly turn the flange, so a tool set in the controller would not show: "
+                f"an offset of the flange from the reported poses is {told}",
+                "check that the controller's tool is zero, or add poses turned by 20 deg about two "
+                "axes",
+            )
+        )
     again = estimate(found.problem, found.places, wrong, found.inliers)
     _, mean, covariance = again.numbers("offset")[0]
     if mean @ np.linalg.solve(covariance, mean) < chi2_quantile(1 - MISFIT, 3):

@@ -131,20 +131,21 @@ def two_translations(carried: Floats, eyes: Floats, x: Floats, z: Floats) -> tup
     return rigid(x, found[:3]), rigid(z, found[3:])
 
 
-def best_rotations(given: RotationTriple, rng: np.random.Generator) -> RotationTriple:
-    """Return the rotations X, Y, Z (3, 3) with the least error over many random starts.
+def two_arms(given: RotationTriple, rng: np.random.Generator) -> RotationTriple:
+    """Return X, Y, Z (4, 4) with the least error over many random starts.
 
     All starts alternate for a few rounds; the best ones continue by Gauss-Newton, which needs a
     hundredth of the steps near the end.
 
     Args:
-        given: Rotations of A, B, C, each (N, 3, 3).
+        given: A, B, C, each (N, 4, 4).
         rng: Draws the starts.
     """
+    a, b, c = (each[:, :3, :3] for each in given)
     # 21 random starts of 20 rounds each; the best three go on with Newton's steps
-    (x, y, z), errors = alternate(given, random_rotations(rng, (21,)), rounds=20)
+    (x, y, z), errors = alternate((a, b, c), random_rotations(rng, (21,)), rounds=20)
     on = np.argsort(errors)[:3]
-    return _settled(given, (x[on], y[on], z[on]))
+    return with_translations(given, _settled((a, b, c), (x[on], y[on], z[on])))
 
 
 def _settled(given: RotationTriple, near: RotationTriple) -> RotationTriple:

@@ -19,13 +19,7 @@ import numpy as np
 
 from flangeye.errors import CalibrationRefused
 from flangeye.estimation.graph import Places, Problem, Sightings
-from flangeye.estimation.start.closed import (
-    best_rotations,
-    motions_of,
-    park_martin,
-    place_of,
-    with_translations,
-)
+from flangeye.estimation.start.closed import motions_of, park_martin, place_of, two_arms
 from flangeye.models.cell import chain
 from flangeye.types import Floats, Indices, Mask
 from flangeye.types.geometry import (
@@ -153,16 +147,19 @@ class _Loop(NamedTuple):
 
     Attributes:
         problem: Problem of these sightings only; all other poses are known.
-        seen: These sightings.
         camera: Known poses (N, 4, 4) and names of unknown frames, in order from the root to the
             camera.
         target: Path from the root to the target.
     """
 
     problem: Problem
-    seen: Sightings
     camera: Sequence[Floats | str]
     target: Sequence[Floats | str]
+
+    @property
+    def seen(self) -> Sightings:
+        """The sightings."""
+        return self.problem.seen
 
     @property
     def unknown(self) -> list[str]:
@@ -173,29 +170,22 @@ class _Loop(NamedTuple):
 def _loop_of(problem: Problem, k: int, known: Places) -> _Loop:
     part = problem.where(np.flatnonzero(problem.seen.pairs == k)).placed(known)
     ends = problem.ends[k]
-    shared = _shared_way(part, *ends)
-    on_way = {name for end in ends for name in chain(part.frames, end)[shared:]}
+    ways = [chain(part.frames, end) for end in ends]
+    shared = sum(1 for a, b in zip(*ways, strict=False) if a == b)
+    on_way = {name for way in ways for name in way[shared:]}
     part = part.placed({n: np.eye(4) for n in part.unknown if n not in on_way})
-    return _Loop(part, part.seen, *(_way(part, end, shared) for end in ends))
+    return _Loop(part, *(_way(part, way[shared:]) for way in ways))
 
 
-def _shared_way(problem: Problem, camera: str, target: str) -> int:
-    ways = chain(problem.frames, camera), chain(problem.frames, target)
-    return sum(1 for a, b in zip(*ways, strict=False) if a == b)
-
-
-def _way(problem: Problem, end: str, shared: int) -> list[Floats | str]:
-    count = len(problem.seen)
-    still = np.tile(np.eye(4), (count, 1, 1))
+def _way(problem: Problem, names: Sequence[str]) -> list[Floats | str]:
+    still = np.tile(np.eye(4), (len(problem.seen), 1, 1))
     out: list[Floats | str] = [still]
-    for name in chain(problem.frames, end)[shared:]:
-        place = problem.frames[name].place
+    for name in names:
+        place = problem.frames[name].at(problem.seen.times).place
         if place is None:
             out += [name, still]
-            continue
-        each = np.asarray(place)
-        each = each[problem.seen.times] if each.ndim == 3 else each
-        out[-1] = np.asarray(out[-1]) @ each
+        else:
+            out[-1] = np.asarray(out[-1]) @ place
     return out
 
 
@@ -292,12 +282,14 @@ def _of_poses(loop: _Loop, rows: Indices, rng: np.random.Generator) -> dict[str,
     names, known = _circle(loop)
     k = [each[rows] for each in known]
     if len(names) == 1:
-        found = [_mean(invert(k[0]))]
+        each = invert(k[0])
+        turn = nearest_rotation(each[:, :3, :3].mean(axis=0))
+        found = [rigid(turn, np.median(each[:, :3, 3], axis=0))]
     elif len(names) == 2:
         x = park_martin(motions_of(k[1], k[0]))
         found = [x, invert(place_of(k[1], x, k[0]))]
     else:
-        x, y, z = _of_two_arms((k[2], k[0], invert(k[1])), rng)
+        x, y, z = two_arms((k[2], k[0], invert(k[1])), rng)
         found = [x, invert(z), invert(y)]
     return {
         name: invert(place) if back else place
@@ -315,20 +307,6 @@ def _circle(loop: _Loop) -> tuple[list[tuple[str, bool]], list[Floats]]:
     known = [*known[:-1], known[-1] @ loop.seen.poses @ behind[0], *behind[1:]]
     # The last leads on into the first: they are one.
     return names, [*known[1:-1], known[-1] @ known[0]]
-
-
-def _mean(poses: Floats) -> Floats:
-    return rigid(
-        nearest_rotation(poses[:, :3, :3].mean(axis=0)), np.median(poses[:, :3, 3], axis=0)
-    )
-
-
-def _of_two_arms(
-    given: tuple[Floats, Floats, Floats], rng: np.random.Generator
-) -> tuple[Floats, Floats, Floats]:
-    """Return X, Y, Z of A X M = Y B Z: rotations by alternation from random starts."""
-    rotations = given[0][:, :3, :3], given[1][:, :3, :3], given[2][:, :3, :3]
-    return with_translations(given, best_rotations(rotations, rng))
 
 
 def _of_points(loop: _Loop, rows: Indices) -> dict[str, Floats]:
