@@ -11,7 +11,8 @@ from typing import cast
 
 import numpy as np
 
-from flangeye.estimation.plan import errors_at_work, estimate_so_far, work_of_frames
+from flangeye.estimation.plan import estimate_so_far, work_of_frames
+from flangeye.maths.statistics import largest_error_quantile
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
 from flangeye.types import ArchivePath
@@ -50,6 +51,15 @@ def levels(cell, plan, seed, every=1):
         if found is not None and len(seen) % every == 0:
             stated = max(errors_at_work(found, model, seen).values())
             yield len(seen), stated, max(true_errors(found, model, seen, truth))
+
+
+def errors_at_work(found, cell, seen):
+    """Return each unknown frame's 95 % bound of the error at its work [m]."""
+    out, work = {}, work_of_frames(found, cell, seen)
+    for i, (name, points) in enumerate(work.items()):
+        own = found.fit.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
+        out[name] = largest_error_quantile(own, found.places[name][:3, 3], points)
+    return out
 
 
 def true_errors(found, cell, seen, truth):

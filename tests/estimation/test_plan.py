@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.estimation.plan import _moved, best_next, errors_at_work, estimate_so_far, predict
+from flangeye.estimation.plan import _moved, best_next, estimate_so_far, predict
 from flangeye.files.paths import bundled
 from flangeye.models.cell import Cell
 from flangeye.plugin.registry import load_registry
@@ -16,6 +16,7 @@ from flangeye.workflow.recipe.load import load_recipe
 from flangeye.workflow.run.folder import RunFolder
 from flangeye.workflow.run.runner import Runner
 from flangeye.workflow.run.session import Start, record_run
+from tools.study_cells import errors_at_work
 
 REGISTRY = load_registry()
 TWO = bundled("recipes") / "configurations" / "two-scanners_marker_most-likely_simulated.yaml"

@@ -89,12 +89,9 @@ def _ways(session: Session, carrier: Carrier) -> list[Estimate]:
     found = session.found
     if carrier.arm in session.cell.joints(session.observations):
         return [found]
-    carriers, out = found.problem.carriers, []
-    for joints in branches_of(found.problem, replace(carrier, joints=None)):
-        moved = [replace(c, joints=joints) if c.arm == carrier.arm else c for c in carriers]
-        problem = replace(found.problem, carriers=moved)
-        out.append(estimate(problem, found.places, found.effects, found.inliers))
-    return out
+    branches = branches_of(found.problem, replace(carrier, joints=None))
+    problems = [found.problem.with_joints(carrier.arm, joints) for joints in branches]
+    return [estimate(each, found.places, found.effects, found.inliers) for each in problems]
 
 
 def _of_one_way(found: Estimate, arm: str) -> ArmParameters:
@@ -132,13 +129,9 @@ def _columns(found: Estimate, arm: str) -> tuple[Indices, Indices]:
 def most_informative_poses(
     session: Session, known: ArmParameters, candidates: Sequence[Observation], count: int
 ) -> tuple[Indices, ArmParameters]:
-    """Return the most informative further sightings, and the covariance with them.
+    """Return ``count`` most informative further sightings, and the parameters known with them.
 
-    Args:
-        session: The sightings so far.
-        known: The arm's parameters as estimated from the session.
-        candidates: Possible further sightings, with joint angles.
-        count: Number of sightings to choose.
+    The parameters ``known`` are those of the session; candidates have joint angles.
     """
     found = session.found
     columns, of_size = _columns(found, FLANGE)

@@ -83,12 +83,7 @@ def calibrate(
 ) -> HandEye:
     """Return every unknown of a cell with its covariance, and the error to expect at the work.
 
-    Args:
-        observations: The sightings.
-        cell: The graph of frames; ``cell_of`` makes it from a configuration.
-        scanner: The scanner's model, if it is known.
-        options: Options of the calibration.
-        method: Name of the stage.
+    ``cell_of`` makes a cell from a configuration; ``method`` is the name of the stage.
 
     Raises:
         StageError: Too few sightings, all the same, or the pose of a moving frame is missing.
@@ -156,16 +151,8 @@ def calibrate_at(
 ) -> HandEye:
     """Return the calibration with places from another method, and the model's covariance.
 
-    Every observation takes part. The covariance is about the given places, so it includes their
-    distance from the most likely ones.
-
-    Args:
-        places: Pose (4, 4) of each unknown.
-        observations: The sightings.
-        cell: The graph of frames.
-        scanner: The scanner's model, if it is known.
-        options: Options of the calibration.
-        method: Name of the stage.
+    Every observation takes part. The covariance is about the given places, a pose (4, 4) of each
+    unknown, so it includes their distance from the most likely ones.
 
     Raises:
         StageError: As of :func:`calibrate`.
@@ -208,7 +195,7 @@ def with_expected_error(
 def _at_best(session: Session) -> Session:
     """Return the session at the better answer that the certificate found, if any, with a note."""
     found = session.found
-    start = verdict_of(found).better
+    _, start = verdict_of(found)
     if start is None:
         return session
     there = estimate(found.problem, start, found.effects, found.inliers)
@@ -408,4 +395,4 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
             f"{'s' if weak.shape[1] > 1 else ''} parallel to the only axis about which the arm "
             f"turned"
         )
-    return [*notes, verdict_of(found).note] if options.certify else notes
+    return [*notes, verdict_of(found)[0]] if options.certify else notes

@@ -130,14 +130,9 @@ def model_at(
     shares: Floats,
     of_session: bool = True,
 ) -> LinearModel:
-    """Return the linear model near some places.
+    """Return the linear model near some places, with weights (N,) of the sightings.
 
-    Args:
-        problem: The estimation problem.
-        places: Pose (4, 4) of each unknown.
-        effects: The possible errors.
-        shares: (N,) weights of the sightings.
-        of_session: Whether the sightings are those of the session, and not new ones.
+    ``of_session`` says whether the sightings are those of the session, and not new ones.
     """
     linear, s = problem.linearised(places), problem.seen
     design, counts = _design(problem, linear, effects, of_session)
@@ -208,11 +203,7 @@ def _further(count: int) -> Floats:
 def estimate(problem: Problem, start: Places, effects: Sequence[Effect], agree: Mask) -> Estimate:
     """Return the joint posterior of all unknown places and effects.
 
-    Args:
-        problem: The estimation problem.
-        start: Pose (4, 4) of each unknown, near the answer.
-        effects: The possible errors.
-        agree: (N,) which sightings agree with the start.
+    The start is near the answer; the sightings in the mask ``agree`` (N,) agree with it.
     """
     places, inliers = start, agree
     z: Floats | None = None

@@ -171,6 +171,11 @@ class Problem:
         projectors[which, :3, :3] = 0.0
         return replace(self, seen=replace(self.seen, projectors=projectors))
 
+    def with_joints(self, arm: str, joints: Floats | None) -> Problem:
+        """Return the problem with an arm's joint angles (T, n) [rad]."""
+        carriers = [replace(c, joints=joints) if c.arm == arm else c for c in self.carriers]
+        return replace(self, carriers=carriers)
+
     def placed(self, places: Places) -> Problem:
         """Return the problem with some unknown places fixed at given values."""
         frames = {n: replace(f, place=places.get(n, f.place)) for n, f in self.frames.items()}

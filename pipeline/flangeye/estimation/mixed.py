@@ -147,30 +147,19 @@ class Fit:
         return np.asarray(whole)
 
 
-class WhitenedModel(NamedTuple):
-    """The whitened sightings at given variance components.
+def whitened(model: LinearModel, sizes: Floats) -> tuple[Floats, Floats, Floats, float]:
+    """Return the whitened sightings at (S,) sizes of the noise.
 
-    Attributes:
-        whitening: (N, 6, 6) roots of the inverse noise covariances, weighted by the shares.
-        rows: (6 N, P + K) the design in units of the noise.
-        errors: (6 N,) the residuals in units of the noise.
-        log_noise: log det of the noise covariance.
+    Returns:
+        Roots (N, 6, 6) of the inverse noise covariances, weighted by the shares; the design (6 N,
+        P + K) and the residuals (6 N,) in units of the noise; and log det of the noise covariance.
     """
-
-    whitening: Floats
-    rows: Floats
-    errors: Floats
-    log_noise: float
-
-
-def whitened(model: LinearModel, sizes: Floats) -> WhitenedModel:
-    """Return the whitened sightings at (S,) sizes of the noise."""
     roots = np.linalg.cholesky(model.noise(sizes))
     whitening = np.sqrt(model.shares)[:, None, None] * np.linalg.inv(roots)
     errors = (whitening @ model.residuals[..., None]).ravel()
     logs = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
     rows = stack_rows(whitening @ model.design)
-    return WhitenedModel(whitening, rows, errors, float(2 * model.shares @ logs))
+    return whitening, rows, errors, float(2 * model.shares @ logs)
 
 
 def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
@@ -181,28 +170,24 @@ def fit(model: LinearModel, sizes: Floats, with_slopes: bool = False) -> Fit:
     Raises:
         numpy.linalg.LinAlgError: The equations are not positive definite.
     """
-    known = whitened(model, sizes)
-    found = _solved(model, sizes, known.rows.T @ known.rows, known.rows.T @ known.errors)
-    left, prior = known.errors - known.rows @ found.mean, sizes[model.sizes.effect] ** -2.0
+    whitening, rows, errors, log_noise = whitened(model, sizes)
+    found = _solved(model, sizes, rows.T @ rows, rows.T @ errors)
+    left, prior = errors - rows @ found.mean, sizes[model.sizes.effect] ** -2.0
     # -2 log REML in Henderson's terms: log |R| + log |S| + log |C| + e'R^-1 e + d'S^-1 d, with S
     # the effects' variances and C the matrix of the mixed-model equations
     cost = float(
-        known.log_noise
+        log_noise
         - np.log(prior).sum()
         + 2 * np.log(np.diag(found.root)).sum()
         + left @ left
         + prior @ found.mean[model.p :] ** 2
     )
     found = replace(found, cost=cost)
-    return _with_slopes(model, found, known, left) if with_slopes else found
+    return _with_slopes(model, found, (whitening, rows, left)) if with_slopes else found
 
 
 def _solved(model: LinearModel, sizes: Floats, information: Floats, right: Floats) -> Fit:
-    """Return the poses and effects that the sightings determine.
-
-    Raises:
-        numpy.linalg.LinAlgError: The equations are not positive definite.
-    """
+    """Return the poses and effects that the sightings determine."""
     diagonal = np.diag(information).copy()
     diagonal[model.p :] += sizes[model.sizes.effect] ** -2.0
     most, whole = diagonal.max(), information.copy()
@@ -219,13 +204,13 @@ def marginal(model: LinearModel, sizes: Floats) -> Floats:
 
     The Schur complement is exact along unobservable moves too; the inverse of a covariance is not.
     """
-    rows, p = whitened(model, sizes).rows, model.p
+    (_, rows, _, _), p = whitened(model, sizes), model.p
     whole = rows.T @ rows
     effects = whole[p:, p:] + np.diag(sizes[model.sizes.effect] ** -2.0)
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
 
-def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Floats) -> Fit:
+def _with_slopes(model: LinearModel, found: Fit, whitened: tuple[Floats, Floats, Floats]) -> Fit:
     r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
     With V the covariance of the residuals, V_i its derivatives, and :math:`P = V^{-1} - V^{-1} G
@@ -237,7 +222,8 @@ def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Flo
 
     In Henderson's terms V_i P y is 2 E delta for an effect E, and V_i R^-1 e for the noise.
     """
-    sizes, effect, p = found.sizes, model.sizes.effect, model.p
+    (whitening, design, left), sizes = whitened, found.sizes
+    effect, p = model.sizes.effect, model.p
     count, n = len(sizes), len(model.residuals)
     # By the size of each effect
     of = (np.arange(count)[:, None] == effect).astype(float)
@@ -245,11 +231,11 @@ def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Flo
     gradient = 2 * of @ (1 - (variances + numbers**2) / sizes[effect] ** 2)
     curvature = np.diag(gradient)
     # By the sizes of the noise, of each of its causes
-    rows, errors = known.rows.reshape(n, 6, -1), left.reshape(n, 6, 1)
-    moved = (known.rows @ found.covariance).reshape(rows.shape)
+    rows, errors = design.reshape(n, 6, -1), left.reshape(n, 6, 1)
+    moved = (design @ found.covariance).reshape(rows.shape)
     spread = moved @ np.swapaxes(rows, 1, 2) + errors * np.swapaxes(errors, 1, 2)
-    back = np.swapaxes(known.whitening, 1, 2)
-    slope = back @ (np.eye(6) - spread) @ known.whitening
+    back = np.swapaxes(whitening, 1, 2)
+    slope = back @ (np.eye(6) - spread) @ whitening
     amounts = sizes[model.factors].prod(axis=1)
     by_cause = amounts * (model.causes.reshape(len(amounts), -1) @ slope.ravel())
     powers = _powers(model)
@@ -257,9 +243,9 @@ def _with_slopes(model: LinearModel, found: Fit, known: WhitenedModel, left: Flo
     curvature += (powers.T * by_cause) @ powers / 2
     # V_i P y in units of the noise, for each size
     changes = np.tensordot(powers.T * amounts, model.causes @ (back @ errors), axes=1)
-    changes = (known.whitening @ changes).reshape(count, -1)
-    changes += 2 * (of * numbers) @ known.rows[:, p:].T
-    across = changes @ known.rows
+    changes = (whitening @ changes).reshape(count, -1)
+    changes += 2 * (of * numbers) @ design[:, p:].T
+    across = changes @ design
     curvature += changes @ changes.T - across @ found.covariance @ across.T
     return replace(found, gradient=gradient, curvature=curvature)
 

@@ -25,7 +25,7 @@ from flangeye.estimation.observability import unobservable
 from flangeye.estimation.session.session import ModelOptions, effects_of
 from flangeye.estimation.start.loops import agreeing, initial_guess
 from flangeye.estimation.start.sightings import problem_of
-from flangeye.maths.statistics import corners_of, largest_error_quantile
+from flangeye.maths.statistics import corners_of
 from flangeye.maths.threads import on_one_thread
 from flangeye.models.cell import Cell, composed
 from flangeye.types import (
@@ -47,10 +47,7 @@ def preview(
 ) -> Estimate:
     """Return a quick estimate with all sizes at their prior medians, for planning and diagnosis.
 
-    Args:
-        problem: The sightings.
-        freedoms: (6, k) unit twists of the possible motions, by frame.
-        search: As of :func:`initial_guess`.
+    Possible motions are unit twists (6, k) by frame; for ``search`` see :func:`initial_guess`.
 
     Raises:
         CalibrationRefused: No initial guess is found, or the sightings leave an unknown
@@ -78,15 +75,6 @@ def estimate_so_far(observations: Sequence[Observation], cell: Cell) -> Estimate
     with suppress(FlangeyeError, np.linalg.LinAlgError):
         return preview(problem_of(observations, cell), cell.freedoms)
     return None
-
-
-def errors_at_work(found: Estimate, cell: Cell, seen: Sequence[Observation]) -> dict[str, float]:
-    """Return each unknown frame's 95 % bound of the error at its work [m]."""
-    out, work = {}, work_of_frames(found, cell, seen)
-    for i, (name, points) in enumerate(work.items()):
-        own = found.fit.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6]
-        out[name] = largest_error_quantile(own, found.places[name][:3, 3], points)
-    return out
 
 
 def work_of_frames(found: Estimate, cell: Cell, seen: Sequence[Observation]) -> dict[str, Floats]:
@@ -136,13 +124,9 @@ def most_informative(
 def best_next(
     candidates: Sequence[Observation], found: Estimate, cell: Cell, seen: Sequence[Observation]
 ) -> int:
-    """Return the candidate that is expected to reduce the error at the work most.
+    """Return the predicted sighting that is expected to reduce the error at the work most.
 
-    Args:
-        candidates: M predicted sightings.
-        found: The estimate from ``seen``.
-        cell: The graph of frames.
-        seen: The sightings so far.
+    The estimate ``found`` is from the sightings ``seen`` so far.
     """
     rows, _ = whitened(candidates, found, cell)
     chosen, _ = most_informative(rows, found.fit.covariance, _levers(found, cell, seen), 1)
@@ -152,11 +136,8 @@ def best_next(
 def predict(moments: Sequence[Observation], places: Places, cell: Cell) -> list[Observation]:
     """Return M sightings of one target by one camera, as predicted from the estimate so far.
 
-    Args:
-        moments: Observations with the carriers' poses, the camera and the target. The feature's
-            value is ignored; its kind and covariance are used.
-        places: Pose (4, 4) of each unknown, as estimated so far.
-        cell: The graph of frames.
+    Moments have the carriers' poses, the camera and the target. The value of their feature is
+    ignored; its kind and covariance are used.
     """
     poses = predicted_poses(moments, places, cell)
     return [

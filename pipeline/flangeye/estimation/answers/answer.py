@@ -83,9 +83,7 @@ def as_true(found: Estimate) -> Answer:
 def as_reported(found: Estimate, work: Work) -> Answer:
     """Return the places for the arms as their controllers report them.
 
-    Args:
-        found: The posterior.
-        work: Where commands are sent; each possible work box has an answer of its own.
+    Commands are sent to the work; each possible work box has an answer of its own.
     """
     return functional(found, commanded(found, work))
 
@@ -119,11 +117,18 @@ class _Commands:
             carried = any(c.frame in chain(self.work.frames, name) for c in self.work.carriers)
             # Not only the target but what is seen within 50 mm of it is to be in its right place
             about = 0.05 if carried else 0.0
-            out.append(self._carried(name, world, about) if carried else self._fixed(name, world))
+            by = self._linear.blocks[name]
+            if carried:
+                # What explains the displacements of a place on an arm best: a camera in hand must
+                # see everything where reported coordinates have it
+                of_world = self._explained(by, self._seen_of_world(name), about)
+                out.append(self._explained(by, self._of_arm, about) + of_world @ world)
+            else:
+                out.append(self._fixed(name, world))
             # Its lasting errors move what it reports at the work as they did in the session
             if any(name == camera for camera, _ in self.work.ends):
-                of_camera = self._explained(self._linear.blocks[name], self._of_camera, about)
-                out[-1] = out[-1] + of_camera
+                of_camera = self._columns(self._linear, "of_camera")
+                out[-1] = out[-1] + self._explained(by, of_camera, about)
         return np.concatenate(out, axis=1)
 
     @cached_property
@@ -134,11 +139,6 @@ class _Commands:
     def _of_arm(self) -> Floats:
         """Twists (W, 6, K) of the sighted targets for unit weights of the arms' errors."""
         return self._columns(self._linear, "of_arm")
-
-    @cached_property
-    def _of_camera(self) -> Floats:
-        """Twists (W, 6, K) of the sighted targets for unit weights of a camera's errors."""
-        return self._columns(self._linear, "of_camera")
 
     def _columns(self, linear: Linear, whose: Literal["of_arm", "of_camera"]) -> Floats:
         still = np.zeros((len(self.work.seen), 6, 0))
@@ -204,15 +204,6 @@ class _Commands:
         shift = np.eye(6)
         shift[3:, :3] = -hat(known[name][:3, 3])
         return np.asarray(shift @ adjoint(invert(parent)) @ gauge)
-
-    def _carried(self, name: str, world: Floats, about: float) -> Floats:
-        """Return the (B, 6, K) motion that explains the displacements of a place on an arm best.
-
-        A camera in hand must see everything where reported coordinates have it.
-        """
-        by = self._linear.blocks[name]
-        of_world = self._explained(by, self._seen_of_world(name), about)
-        return self._explained(by, self._of_arm, about) + of_world @ world
 
     def _seen_of_world(self, name: str) -> Floats:
         """Return (W, 6, 6): how a twist of reported root coordinates moves the sighted targets.

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from flangeye.estimation.effects.arm import joints_known, kinematics_and_joints
-from flangeye.estimation.graph import Carrier, Places, Problem, Sightings
+from flangeye.estimation.graph import Carrier, Places, Problem
 from flangeye.maths.arm_correction import reached_from
 from flangeye.maths.statistics import spread_evenly
 from flangeye.types import Box, Floats, Indices
@@ -53,7 +53,7 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     carrier = problem.carriers[0] if len(problem.carriers) == 1 else None
     # One arm's flange can be sent to new poses; a rail goes along its line, and all else stays
     if carrier is None or carrier.link is not None or carrier.axis:
-        return _all_of(session)
+        return Work(session, session, np.full((1, len(session.seen)), 1 / len(session.seen)))
     poses = np.asarray(problem.frames[carrier.frame].place)[problem.seen.times]
     rotations = poses[:, :3, :3]
     if box is not None:
@@ -68,14 +68,6 @@ def work_of(problem: Problem, places: Places, box: Box | None = None) -> Work:
     # evenly drawn poses to the box's side the distance is exponential, with the spacing as mean
     beyond = np.random.default_rng(0).exponential(size=(8, 2, 3)).clip(max=widest)
     return Work(session, wide, _weights(wide, rotations, inner + beyond * outward))
-
-
-def _all_of(work: Problem) -> Work:
-    return Work(work, work, np.full((1, len(work.seen)), 1 / len(work.seen)))
-
-
-def _simulated(work: Problem, places: Places) -> Problem:
-    return replace(work, seen=_predicted(work, places))
 
 
 def _weights(work: Problem, rotations: Floats, boxes: Floats) -> Floats:
@@ -156,8 +148,8 @@ def _in_box(problem: Problem, carrier: Carrier, box: Floats) -> Problem:
     )
 
 
-def _predicted(problem: Problem, places: Places) -> Sightings:
-    """Return a problem's predicted sightings, each with its noise rotated accordingly."""
+def _simulated(problem: Problem, places: Places) -> Problem:
+    """Return a problem with predicted sightings, each with its noise rotated accordingly."""
     s, count = problem.seen, len(problem.seen)
     out = problem.predicted(places)
     rotations, ranks = out[:, :3, :3], s.ranks
@@ -169,10 +161,11 @@ def _predicted(problem: Problem, places: Places) -> Sightings:
     turn[ranks < 5] = np.eye(3)
     both = np.zeros((count, 6, 6))
     both[:, :3, :3] = both[:, 3:, 3:] = turn
-    return replace(
+    seen = replace(
         s,
         rotations=rotations,
         centres=each_applied(out, s.offsets),
         covariances=projectors @ both @ s.covariances @ np.swapaxes(both, 1, 2) @ projectors,
         projectors=projectors,
     )
+    return replace(problem, seen=seen)

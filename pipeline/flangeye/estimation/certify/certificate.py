@@ -92,15 +92,12 @@ def _elsewhere(squares: Quadratic, lack: Floats, count: int) -> Floats:
         start = np.tile(np.eye(4), (count, 1, 1))
         features = way * np.copysign(1.0, way[0])
         for family in squares.families:
-            start[family.first, :3, :3] = _rotation(features[family.at[1:, 0]])
+            start[family.first, :3, :3] = nearest_rotation(features[family.at[1:, 0]].reshape(3, 3))
             for other in family.after:
-                start[other, :3, :3] = _rotation(features[family.of(other)[0, :9]])
+                turn = features[family.of(other)[0, :9]].reshape(3, 3)
+                start[other, :3, :3] = nearest_rotation(turn)
         tried.append(squares.descend(start))
     return min(tried, key=squares.cost)
-
-
-def _rotation(entries: Floats) -> Floats:
-    return nearest_rotation(entries.reshape(3, 3))
 
 
 # --- multipliers ---------------------------------------------------------------------------------

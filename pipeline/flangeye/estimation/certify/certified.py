@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,27 +25,19 @@ OPTIMAL = "globally optimal: no other answer fits the inlier poses better"
 NOT_CERTIFIED = "not certified as globally optimal"
 
 
-class CertificateVerdict(NamedTuple):
-    """Whether an answer is certified as optimal, and a better one if found.
-
-    Attributes:
-        note: The verdict in words.
-        better: (4, 4) poses of the unknown frames that fit better, if such were found.
-    """
-
-    note: str
-    better: Mapping[str, Floats] | None = None
-
-
-def verdict_of(found: Estimate) -> CertificateVerdict:
+def verdict_of(found: Estimate) -> tuple[str, Places | None]:
     """Return whether the answer is proven optimal for the inlying sightings, or a better one.
 
     The effects are kept at their estimates.
+
+    Returns:
+        The verdict in words, and (4, 4) poses of the unknown frames that fit better, if such were
+        found.
     """
     problem = _agreeing(found)
     root = _seen_from(problem, list(found.places))
     if root is None:
-        return CertificateVerdict(_not_certifiable(problem))
+        return _not_certifiable(problem), None
     back = chain(problem.frames, root)
 
     def named(places: Floats) -> Places:
@@ -60,9 +51,9 @@ def verdict_of(found: Estimate) -> CertificateVerdict:
             f"{NOT_CERTIFIED} (gap {share:.1%}): another answer may have squared errors "
             "smaller by that share"
         )
-        return CertificateVerdict(note, None if shown.better is None else named(shown.better))
+        return note, None if shown.better is None else named(shown.better)
     away = _far_away(found, start, shown.places)
-    return CertificateVerdict(away, named(shown.places)) if away else CertificateVerdict(OPTIMAL)
+    return (away, named(shown.places)) if away else (OPTIMAL, None)
 
 
 def _agreeing(found: Estimate) -> Problem:
@@ -96,7 +87,7 @@ def _far_away(found: Estimate, start: Floats, certified: Floats) -> str | None:
 
 def _not_certifiable(problem: Problem) -> str:
     def between(k: int) -> list[str]:
-        return [step.name for way in _unknown(problem, k) for step in way]
+        return [name for way in _unknown(problem, k) for name in way]
 
     most = max(_pairs(problem), key=lambda k: len(between(k)))
     camera, target = problem.ends[most]
@@ -109,11 +100,8 @@ def _not_certifiable(problem: Problem) -> str:
 # --- from where the graph is looked at -----------------------------------------------------------
 
 
-class PathStep(NamedTuple):
-    """One frame on the path between camera and target, forwards or inverted."""
-
-    name: str
-    back: bool
+PathStep = tuple[str, bool]
+"""One frame on the path between camera and target, and whether it is inverted."""
 
 
 def _pairs(problem: Problem) -> list[int]:
@@ -124,10 +112,7 @@ def _pairs(problem: Problem) -> list[int]:
 def _ways(problem: Problem, k: int, root: str = "") -> list[list[PathStep]]:
     """Return the paths to a camera and to a target, from their last common frame.
 
-    Args:
-        problem: The sightings.
-        k: Which camera and target.
-        root: Frame taken as the graph's root; its own root by default.
+    ``root`` is the frame taken as the graph's root, its own by default.
     """
     first, second = (_way(problem.frames, root, end) for end in problem.ends[k])
     shared = sum(1 for a, b in zip(first, second, strict=False) if a == b)
@@ -137,13 +122,14 @@ def _ways(problem: Problem, k: int, root: str = "") -> list[list[PathStep]]:
 def _way(frames: Mapping[str, Frame], root: str, end: str) -> list[PathStep]:
     up, down = chain(frames, root), chain(frames, end)
     shared = sum(1 for a, b in zip(up, down, strict=False) if a == b)
-    back = [PathStep(name, True) for name in reversed(up[shared:])]
-    return [*back, *(PathStep(name, False) for name in down[shared:])]
+    back = [(name, True) for name in reversed(up[shared:])]
+    return [*back, *((name, False) for name in down[shared:])]
 
 
-def _unknown(problem: Problem, k: int, root: str = "") -> list[list[PathStep]]:
+def _unknown(problem: Problem, k: int, root: str = "") -> list[list[str]]:
     """Return the unknown frames on the paths to a camera and to a target."""
-    return [[s for s in way if s.name in problem.unknown] for way in _ways(problem, k, root)]
+    ways = _ways(problem, k, root)
+    return [[name for name, _ in way if name in problem.unknown] for way in ways]
 
 
 def _seen_from(problem: Problem, names: Sequence[str]) -> str | None:
@@ -159,7 +145,7 @@ def _seen_from(problem: Problem, names: Sequence[str]) -> str | None:
 def _size(problem: Problem, names: Sequence[str], root: str) -> int:
     """Return the size of the certificate's matrix for a root; 0 if the errors are not quadratic."""
     ways = [way for k in _pairs(problem) for way in _unknown(problem, k, root)]
-    pairs = {(names.index(w[0].name), names.index(w[1].name)) for w in ways if len(w) == 2}
+    pairs = {(names.index(w[0]), names.index(w[1])) for w in ways if len(w) == 2}
     nested = {u for u, _ in pairs} & {v for _, v in pairs}
     if nested or any(len(way) > 2 for way in ways):
         return 0
@@ -211,13 +197,13 @@ def _side(
     """Return a path as one side of the equations: it has at most two unknown places."""
     still = np.tile(np.eye(4), (len(times), 1, 1))
     known, unknown = [still], list[int]()
-    for step in way:
-        if step.name in names:
-            unknown.append(names.index(step.name))
+    for name, back in way:
+        if name in names:
+            unknown.append(names.index(name))
             known.append(still)
             continue
-        place = np.asarray(problem.frames[step.name].at(times).place)
-        known[-1] = known[-1] @ (invert(place) if step.back else place)
+        place = np.asarray(problem.frames[name].at(times).place)
+        known[-1] = known[-1] @ (invert(place) if back else place)
     # The last is after the last unknown; what is not there is none of them, and nothing between.
     lacking = 2 - len(unknown)
     (u, v), (a, b, c) = [len(names)] * lacking + unknown, [still] * lacking + known

@@ -294,9 +294,7 @@ def _by_both(before: Floats, entries: Floats) -> Floats:
 def _of_entries(s: LiftedSightings, turned: Floats) -> Floats:
     """Return the (N, 12, 12) weights of the difference of both sides' entries.
 
-    Args:
-        s: The sightings.
-        turned: (N, 3, 3) rotation of either side, as found.
+    ``turned`` is the rotation (N, 3, 3) of either side, as found.
     """
     errors, beyond = np.zeros((len(turned), 6, 12)), np.zeros((len(turned), 9, 9))
     mean = np.trace(s.weights[:, :3, :3], axis1=1, axis2=2) / np.maximum(s.freedoms - 3, 1)

@@ -41,12 +41,9 @@ def _delay(camera: str, problem: Problem, linear: Linear) -> Floats:
 def delayed(
     observations: Sequence[Observation], cell: Cell, delays: Mapping[str, float]
 ) -> list[Observation] | None:
-    """Return the observations with the arm poses a delay later; None beyond the recorded motion.
+    """Return observations with the arm poses later by their camera's delay [s].
 
-    Args:
-        observations: Observations with the arms' recorded motion.
-        cell: The graph of frames.
-        delays: Delay by camera [s].
+    None if a delay is beyond the recorded motion.
     """
     moved = []
     for o in observations:

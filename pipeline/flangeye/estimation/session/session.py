@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from flangeye.errors import CalibrationRefused, StageError
-from flangeye.estimation.effects.arm import arm_effects, kinematics_and_joints
+from flangeye.estimation.effects.arm import arm_effects
 from flangeye.estimation.effects.camera import camera_effects, drift_effects
 from flangeye.estimation.effects.clock import clock_effects, delayed
 from flangeye.estimation.effects.effect import Effect
@@ -29,6 +29,7 @@ from flangeye.estimation.observability import (
 from flangeye.estimation.start.loops import agreeing, distances, initial_guess, size_of
 from flangeye.estimation.start.sightings import branches_of, problem_of
 from flangeye.maths.arm_correction import reached_from
+from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.maths.threads import on_one_thread
 from flangeye.models.cell import Cell
@@ -225,11 +226,7 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
 
 
 def _require_right_handed(problem: Problem, places: Places) -> None:
-    """Refuse sightings that agree far better in a mirror.
-
-    Raises:
-        CalibrationRefused: The mirrored fit is far better; the message gives both residuals.
-    """
+    """Refuse sightings that agree far better in a mirror."""
     # Rotations as S R S, S the mirror, which is a rotation again; S R alone is not
     flip, s = np.array([1.0, 1.0, -1.0]), problem.seen
     mirrored = replace(
@@ -261,10 +258,12 @@ def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem
     """
     notes: list[Note] = []
     for carrier in problem.carriers:
-        if carrier.kinematics is None or carrier.link is not None:
+        arm = carrier.kinematics
+        if arm is None or carrier.link is not None:
             continue
-        problem = _with_joints(problem, carrier.arm, _likeliest(problem, carrier, places, agree))
-        if next(c for c in problem.carriers if c.arm == carrier.arm).joints is None:
+        joints = _likeliest(problem, carrier, arm, places, agree)
+        problem = problem.with_joints(carrier.arm, joints)
+        if joints is None:
             notes.append(
                 f"the kinematic model of {carrier.arm} does not reproduce the reported poses: "
                 f"errors of its joints are not estimated"
@@ -272,7 +271,9 @@ def _on_branches(problem: Problem, places: Places, agree: Mask) -> tuple[Problem
     return problem, tuple(notes)
 
 
-def _likeliest(problem: Problem, carrier: Carrier, places: Places, agree: Mask) -> Floats | None:
+def _likeliest(
+    problem: Problem, carrier: Carrier, arm: Arm, places: Places, agree: Mask
+) -> Floats | None:
     """Return an arm's joint angles (T, n) on the branch that is most likely by some sightings."""
     if carrier.joints is not None:
         return next(branches_of(problem, carrier), None)
@@ -280,21 +281,15 @@ def _likeliest(problem: Problem, carrier: Carrier, places: Places, agree: Mask) 
     # Forty tell as much as hundreds: branches differ by a few numbers of the arm's errors
     times = np.unique(kept[np.linspace(0, len(kept) - 1, 40).astype(int)])
     some = problem.where(agree).at(times)
-    tried = [_with_joints(some, carrier.arm, each) for each in branches_of(some, carrier)]
+    tried = list(branches_of(some, carrier))
     if tried[1:]:
-        tried.sort(key=lambda one: _cost(one, places))
+        tried.sort(key=lambda near: _cost(some.with_joints(carrier.arm, near), places))
     poses = np.asarray(problem.frames[carrier.frame].place)
-    for one in tried:
-        arm, near = kinematics_and_joints(next(c for c in one.carriers if c.frame == carrier.frame))
+    for near in tried:
         joints, reached = reached_from(arm, poses, near[0])
         if reached.all():
             return joints
     return None
-
-
-def _with_joints(problem: Problem, arm: str, joints: Floats | None) -> Problem:
-    carriers = [replace(c, joints=joints) if c.arm == arm else c for c in problem.carriers]
-    return replace(problem, carriers=carriers)
 
 
 def _cost(problem: Problem, places: Places) -> float:
@@ -354,11 +349,7 @@ def _with_walk(session: Session) -> Session:
 
 
 def _on_one_clock(session: Session) -> Session:
-    """Return the session with estimated clock delays applied to the arms' poses.
-
-    Raises:
-        CalibrationRefused: A clock delay exceeds the motion recorded about each capture.
-    """
+    """Return the session with estimated clock delays applied to the arms' poses."""
     total: dict[str, float] = {}
     moved = session
     for _ in range(6):
@@ -436,12 +427,7 @@ def _resized(observations: Sequence[Observation], factor: float) -> list[Observa
 
 
 def _require_size(session: Session) -> None:
-    """Refuse a marker size or focal length that contradicts the arm's motion.
-
-    Raises:
-        CalibrationRefused: A size or focal length contradicts it; the message has the better
-            estimate.
-    """
+    """Refuse a marker size or focal length that contradicts the arm's motion."""
     found, kinds = session.found, ("size", "focal")
     likeliest = [abs(found.fit.mean[at][0]) for kind in kinds for _, at in found.rows(kind)]
     if not likeliest:

@@ -107,9 +107,7 @@ def shah(carried: Floats, seen: Floats) -> tuple[Floats, Floats]:
     Rotations by the singular vectors of the summed Kronecker products, then both translations by
     linear least squares.
 
-    Args:
-        carried: (N, 4, 4) G, target_carrier_T_camera_carrier.
-        seen: (N, 4, 4) M, camera_T_target.
+    G and M are (N, 4, 4), as in the module's head.
     """
     eyes = invert(seen)
     products = np.einsum("nji,nlk->ikjl", carried[:, :3, :3], eyes[:, :3, :3])
@@ -137,9 +135,7 @@ def two_arms(given: RotationTriple, rng: np.random.Generator) -> RotationTriple:
     All starts alternate for a few rounds; the best ones continue by Gauss-Newton, which needs a
     hundredth of the steps near the end.
 
-    Args:
-        given: A, B, C, each (N, 4, 4).
-        rng: Draws the starts.
+    A, B and C are each (N, 4, 4).
     """
     a, b, c = (each[:, :3, :3] for each in given)
     # 21 random starts of 20 rounds each; the best three go on with Newton's steps
@@ -218,11 +214,8 @@ def random_rotations(rng: np.random.Generator, count: tuple[int, ...] = ()) -> R
 def with_translations(given: RotationTriple, rotations: RotationTriple) -> RotationTriple:
     """Return X, Y, Z (4, 4): the translations fit the rotations by linear least squares.
 
-    ``R_A t_X - R_Y R_C t_Z - t_Y = R_Y t_C - t_A - R_A R_X t_B`` for every pose.
-
-    Args:
-        given: A, B, C, each (N, 4, 4).
-        rotations: Rotations of X, Y, Z, each (3, 3).
+    ``R_A t_X - R_Y R_C t_Z - t_Y = R_Y t_C - t_A - R_A R_X t_B`` for every pose. A, B and C are
+    each (N, 4, 4), the rotations (3, 3).
     """
     (a, b, c), (x, y, z) = given, rotations
     rows = np.zeros((len(a), 3, 9))

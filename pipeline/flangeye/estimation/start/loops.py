@@ -11,7 +11,7 @@ next loop. If no further loop can be solved, descents start from random places.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -196,13 +196,13 @@ def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
     & Zisserman 2000). That half must not decide alone: if an arm stood still in half of the
     sightings, many places fit those.
     """
-    form = _form_of(loop)
-    if form is None or len(loop.seen) < form.fewest:
+    fewest = _fewest(loop)
+    if fewest is None or len(loop.seen) < fewest:
         return None
     n = len(loop.seen)
     most = 40  # one closed form takes so many: more cost time and change the start little
     everyone = np.arange(n) if n <= most else rng.choice(n, most, replace=False)
-    size = min(form.fewest + (1 if n > form.fewest else 0), n)
+    size = min(fewest + (1 if n > fewest else 0), n)
     tried: list[tuple[dict[str, Floats], Floats]] = []
     least, of_all = np.inf, np.inf
     for draw in range(-1, SETS):
@@ -211,7 +211,7 @@ def _solved(loop: _Loop, rng: np.random.Generator) -> dict[str, Floats] | None:
             break
         chosen = everyone if draw < 0 else rng.choice(n, size, replace=False)
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
-            places = form.solve(chosen, rng)
+            places = _closed(loop, chosen, rng)
             tried.append((places, distances(loop.problem, places)))
             least = min(least, float(np.median(tried[-1][1])))
         if draw < 0:
@@ -228,25 +228,24 @@ def distances(problem: Problem, places: Places) -> Floats:
     return np.asarray((LEVER**2 * r[:, :3] ** 2).sum(axis=1) + (r[:, 3:] ** 2).sum(axis=1))
 
 
-class _LoopSolver(NamedTuple):
-    """A closed form: how many sightings it needs, and a function from sightings to places."""
-
-    fewest: int
-    solve: Callable[[Indices, np.random.Generator], dict[str, Floats]]
-
-
-def _form_of(loop: _Loop) -> _LoopSolver | None:
-    """Return the closed form of a loop; None where there is none."""
-    whole, count = bool((loop.seen.ranks == 6).all()), len(loop.unknown)
-    if whole and count <= 3:
-        return _LoopSolver({1: 1, 2: 3, 3: 6}[count], lambda rows, rng: _of_poses(loop, rows, rng))
+def _fewest(loop: _Loop) -> int | None:
+    """Return how many sightings the closed form of a loop needs; None where there is none."""
+    ranks, count = loop.seen.ranks, len(loop.unknown)
+    if (ranks == 6).all() and count <= 3:
+        return {1: 1, 2: 3, 3: 6}[count]
     if count == 1:
-        of_point = loop.unknown[0] == loop.target[-2] if len(loop.target) > 1 else False
-        return _LoopSolver(1 if of_point else 3, lambda rows, rng: _of_points(loop, rows))
+        of_point = len(loop.target) > 1 and loop.unknown[0] == loop.target[-2]
+        return 1 if of_point else 3
     if count == 2 and len(loop.camera) == len(loop.target) == 3:
-        fewest = 5 if (loop.seen.ranks >= 5).all() else 8
-        return _LoopSolver(fewest, lambda rows, rng: _linear(loop, rows))
+        return 5 if (ranks >= 5).all() else 8
     return None
+
+
+def _closed(loop: _Loop, rows: Indices, rng: np.random.Generator) -> dict[str, Floats]:
+    """Return the places of a loop with a closed form, from some of its sightings."""
+    if (loop.seen.ranks == 6).all():
+        return _of_poses(loop, rows, rng)
+    return _of_points(loop, rows) if len(loop.unknown) == 1 else _linear(loop, rows)
 
 
 def loop_of(problem: Problem) -> tuple[list[tuple[str, bool]], list[Floats]]:
@@ -264,14 +263,12 @@ def start_of_circles(problem: Problem) -> dict[str, Floats]:
         CalibrationRefused: The loop has no closed form.
     """
     loop = _loop_of(problem, 0, {})
-    form = _form_of(loop)
-    if form is None:
+    if _fewest(loop) is None:
         raise CalibrationRefused(
             "two arms with a circle at an unknown place cannot be solved",
             "state its place, which is known for the flange's own circle, or use a marker",
         )
-    rows = np.arange(len(loop.seen))
-    return form.solve(rows, np.random.default_rng(0))
+    return _closed(loop, np.arange(len(loop.seen)), np.random.default_rng(0))
 
 
 # --- closed forms of a loop ----------------------------------------------------------------------

@@ -25,12 +25,8 @@ for another arm's."""
 def problem_of(observations: Sequence[Observation], cell: Cell, normals: bool = True) -> Problem:
     """Return N observations as a problem of N sightings, each at its own time.
 
-    Joint angles that were not recorded stay unknown; see ``branches_of``.
-
-    Args:
-        observations: The measurements.
-        cell: The graph of frames.
-        normals: Whether the normals of circles are used.
+    Joint angles that were not recorded stay unknown; see ``branches_of``. ``normals`` says whether
+    the normals of circles are used.
 
     Raises:
         StageError: There is no observation, or one lacks the pose of a moving frame.

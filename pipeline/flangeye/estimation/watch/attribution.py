@@ -48,14 +48,9 @@ def attribute_change(
 def explained(
     before: Information, after: CheckSightings, about: Floats, scanner: Floats, daily: float
 ) -> bool:
-    """Return whether one move, of the scanner, the flange or the arm, explains the sightings.
+    """Return whether one move explains the sightings: of the scanner, the flange or the arm.
 
-    Args:
-        before: Estimate of the camera motion and the arm's error weights before the change.
-        after: Sightings since the change.
-        about: (3,) reference point of the motions, in base [m].
-        scanner: (3,) the scanner's position, about which it rotates, in base [m].
-        daily: Standard deviation of the cell's day-to-day motion at the work [m].
+    Arguments are those of :func:`attribute_change`.
     """
     residuals = (after.residuals + after.effects @ before.mean).ravel()
     noise = _noise(before, after, daily)
