@@ -14,11 +14,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from flangeye.estimation.watch.drift import CheckSightings, sightings_of
 from flangeye.maths.kinematics import Arm
 from flangeye.models.loading import load_model
 from flangeye.types import Floats
 from flangeye.types.geometry import rigid, rotation_exp, rotation_from_rpy
+from flangeye.workflow.doctor.monitor.drift import CheckSightings, sightings_of
 
 ABOUT = np.array([0.45, 0.0, 0.35])
 CORNERS = 0.15 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

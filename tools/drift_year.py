@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flangeye.estimation.watch.attribution import attribute_change, suspects
-from flangeye.estimation.watch.drift import (
+from flangeye.workflow.doctor.monitor.attribution import attribute_change, suspects
+from flangeye.workflow.doctor.monitor.drift import (
     DriftTest,
     Information,
     Prior,

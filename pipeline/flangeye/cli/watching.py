@@ -13,8 +13,8 @@ from flangeye.cli.app import Overrides, app, load_plugins
 from flangeye.cli.console import say
 
 if TYPE_CHECKING:
-    from flangeye.estimation.watch.drift import DriftTest
     from flangeye.plugin.registry import Registry
+    from flangeye.workflow.doctor.monitor.drift import DriftTest
     from flangeye.workflow.doctor.monitor.history import MonitorCheck
     from flangeye.workflow.doctor.monitor.stored import StoredCalibration
 
@@ -106,8 +106,8 @@ def monitor(  # noqa: PLR0913  one argument an option
 
 def _drift_test(false_alarms: float, limit: str) -> DriftTest:
     from flangeye.errors import StageError
-    from flangeye.estimation.watch.drift import DriftTest
     from flangeye.units import parse_quantity
+    from flangeye.workflow.doctor.monitor.drift import DriftTest
 
     try:
         return DriftTest(false_alarms=false_alarms, limit=parse_quantity(limit, "length"))

@@ -5,7 +5,6 @@ from typing import ClassVar
 import numpy as np
 
 from flangeye import Params, stage
-from flangeye.estimation.watch.drift import DriftTest, information_of, verdict
 from flangeye.files.paths import RecipeFile
 from flangeye.types import HandEye, Verification
 from flangeye.units import Length, param
@@ -40,11 +39,7 @@ def verify_drift(calibration: HandEye, params: DriftParams) -> Verification:
     """
     stored = stored_calibration(params.reference)
     seen = [pair.observation for pair in calibration.pairs if pair.used]
-    sightings = stored.sightings(seen, np.zeros(len(seen), dtype=np.intp))
-    test = DriftTest(false_alarms=params.false_alarms, limit=params.limit)
-    told = information_of(sightings, test.daily)
-    # One check at once: the earlier calibration is the only prior.
-    found = verdict(told, stored.prior, stored.corners, test)
+    found = stored.drift(seen, params.limit, params.false_alarms)
     shift = f"{found.shift * 1e3:.2f} mm at the work's worst corner"
     figures = {
         "shift": found.shift,

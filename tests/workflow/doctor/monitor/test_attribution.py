@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flangeye.estimation.watch.attribution import _noise, attribute_change, explained, suspects
-from flangeye.estimation.watch.drift import CheckSightings, Information, allowance
 from flangeye.types import Floats
 from flangeye.types.geometry import hat
+from flangeye.workflow.doctor.monitor.attribution import (
+    _noise,
+    attribute_change,
+    explained,
+    suspects,
+)
+from flangeye.workflow.doctor.monitor.drift import CheckSightings, Information, allowance
 from tools.checked_year import ABOUT, Happening, Year, watch
 
 DAILY = 3e-5

@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flangeye.estimation.watch.drift import (
+from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
+from flangeye.types import Floats
+from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.workflow.doctor.monitor.drift import (
     CheckSightings,
     DriftTest,
     Information,
@@ -29,9 +32,6 @@ from flangeye.estimation.watch.drift import (
     sightings_of,
     verdict,
 )
-from flangeye.maths.statistics import MISFIT, chi2_quantile, f_quantile
-from flangeye.types import Floats
-from flangeye.types.geometry import rigid, rotation_exp
 from tools import drift_year
 from tools.checked_year import CORNERS, Happening, Year, watch
 
@@ -209,7 +209,7 @@ def test_a_scanner_knocked_by_millimetres_is_found_at_once_and_named() -> None:
 
 
 def test_a_joint_re_mastered_is_named() -> None:
-    from flangeye.estimation.watch.attribution import attribute_change, suspects
+    from flangeye.workflow.doctor.monitor.attribution import attribute_change, suspects
     from tools.checked_year import ABOUT, step_at
 
     wrong = step_at(40, np.array([0, 0, 2e-3, 0, 0, 0]))

@@ -13,8 +13,8 @@ import pytest
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import DriftTest
 from flangeye.workflow.doctor.monitor.chart import STATE_COLOURS, figure, sentence, write_chart
+from flangeye.workflow.doctor.monitor.drift import DriftTest
 from flangeye.workflow.doctor.monitor.history import (
     CheckFinding,
     History,

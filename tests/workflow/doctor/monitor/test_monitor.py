@@ -21,10 +21,10 @@ from typer.testing import CliRunner, Result
 
 from flangeye.cli import commands
 from flangeye.errors import FlangeyeError, StageError
-from flangeye.estimation.watch.drift import DriftTest
 from flangeye.types.geometry import rigid
 from flangeye.workflow.doctor.monitor import from_arm
 from flangeye.workflow.doctor.monitor.chart import figure
+from flangeye.workflow.doctor.monitor.drift import DriftTest
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History
 from flangeye.workflow.doctor.monitor.stored import stored_calibration
 from flangeye.workflow.doctor.monitor.verdicts import judge, write_state

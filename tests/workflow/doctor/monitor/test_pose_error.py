@@ -8,14 +8,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from flangeye.estimation.watch.pose_error import (
+from flangeye.types import Floats
+from flangeye.types.geometry import hat, rigid, rotation_exp, rotation_log
+from flangeye.workflow.doctor.monitor.pose_error import (
     ArmPoseErrors,
     _unlikelihood,
     _unsized,
     pose_error_of,
 )
-from flangeye.types import Floats
-from flangeye.types.geometry import hat, rigid, rotation_exp, rotation_log
 
 NOISE = np.diag([3e-5**2] * 3 + [1e-4**2] * 2)
 

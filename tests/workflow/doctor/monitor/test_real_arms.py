@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from flangeye.cli import commands
-from flangeye.estimation.watch.drift import DriftTest
 from flangeye.types import Observation
+from flangeye.workflow.doctor.monitor.drift import DriftTest
 from flangeye.workflow.doctor.monitor.history import History, MonitorCheck
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
 from flangeye.workflow.doctor.monitor.verdicts import judge

@@ -13,7 +13,6 @@ import pytest
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import CheckSightings, DriftTest, DriftVerdict, Information
 from flangeye.maths.kinematics import Arm
 from flangeye.maths.statistics import corners_of
 from flangeye.models.loading import load_model
@@ -21,6 +20,12 @@ from flangeye.plugin.registry import load_registry
 from flangeye.types import Floats
 from flangeye.types.geometry import rotation_exp
 from flangeye.workflow.doctor.monitor import from_archive, verdicts
+from flangeye.workflow.doctor.monitor.drift import (
+    CheckSightings,
+    DriftTest,
+    DriftVerdict,
+    Information,
+)
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History, MonitorCheck
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration, stored_calibration
 from tests.workflow.doctor.monitor.cell import WORKSPACE, calibrate, check

@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flangeye.estimation.watch.drift import DriftTest
 from flangeye.files.regular import write_whole
+from flangeye.workflow.doctor.monitor.drift import DriftTest
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History
 from flangeye.workflow.report.look import LIGHT, SERIES, templates
 

@@ -18,8 +18,8 @@ from pydantic import Field
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import DriftState
 from flangeye.files.regular import read_regular, write_whole
+from flangeye.workflow.doctor.monitor.drift import DriftState
 from flangeye.workflow.log.read import decode_json
 from flangeye.workflow.log.record import adapter
 from flangeye.workflow.log.records import DamageError, reason_of

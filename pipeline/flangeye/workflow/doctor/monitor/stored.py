@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from flangeye import types as t
 from flangeye.errors import StageError
-from flangeye.estimation.watch.drift import CheckSightings, Prior, prior_of, sightings_of
-from flangeye.estimation.watch.pose_error import ArmPoseErrors, pose_error_of
 from flangeye.files.yaml_lines import parse_yaml
 from flangeye.maths.arm_correction import corrected_flange
 from flangeye.maths.kinematics import Arm
@@ -24,6 +22,17 @@ from flangeye.models.loading import load_model
 from flangeye.models.workspace import workspace_of
 from flangeye.types import Floats
 from flangeye.types.geometry import invert, rigid
+from flangeye.workflow.doctor.monitor.drift import (
+    CheckSightings,
+    DriftTest,
+    DriftVerdict,
+    Prior,
+    information_of,
+    prior_of,
+    sightings_of,
+    verdict,
+)
+from flangeye.workflow.doctor.monitor.pose_error import ArmPoseErrors, pose_error_of
 from flangeye.workflow.log.read import RunLog, read_run
 from flangeye.workflow.recipe.own_models import carried_files
 
@@ -107,6 +116,18 @@ class StoredCalibration:
         """Prior of later sightings, from the calibration's own sightings."""
         sightings = self.sightings(self.used, _one_check(self.used))
         return prior_of(sightings, self.pose_error.with_camera)
+
+    def drift(
+        self, seen: Sequence[t.Observation], limit: float, false_alarms: float
+    ) -> DriftVerdict:
+        """Return the verdict on sightings taken as one check, with no prior but this calibration.
+
+        The work may drift by ``limit`` [m]; a cell that did not move is refused with the
+        probability ``false_alarms``.
+        """
+        test = DriftTest(false_alarms=false_alarms, limit=limit)
+        told = information_of(self.sightings(seen, _one_check(seen)), test.daily)
+        return verdict(told, self.prior, self.corners, test)
 
     def sightings(self, seen: Sequence[t.Observation], check: NDArray[np.intp]) -> CheckSightings:
         """Return sightings of the target with their deviation from this calibration.

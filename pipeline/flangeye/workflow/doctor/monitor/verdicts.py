@@ -9,8 +9,9 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from flangeye.errors import StageError
-from flangeye.estimation.watch.attribution import attribute_change, explained, suspects
-from flangeye.estimation.watch.drift import (
+from flangeye.files.remote import is_this_machine
+from flangeye.workflow.doctor.monitor.attribution import attribute_change, explained, suspects
+from flangeye.workflow.doctor.monitor.drift import (
     CheckSightings,
     DriftTest,
     DriftVerdict,
@@ -20,7 +21,6 @@ from flangeye.estimation.watch.drift import (
     moved_since,
     verdict,
 )
-from flangeye.files.remote import is_this_machine
 from flangeye.workflow.doctor.monitor.history import CheckFinding, History, MonitorCheck
 from flangeye.workflow.doctor.monitor.stored import StoredCalibration
 

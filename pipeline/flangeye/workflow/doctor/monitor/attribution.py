@@ -10,10 +10,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flangeye.estimation.watch.drift import CheckSightings, Information, allowance
 from flangeye.maths.statistics import MISFIT, chi2_quantile
 from flangeye.types import Floats
 from flangeye.types.geometry import adjoint_shift, stack_rows
+from flangeye.workflow.doctor.monitor.drift import CheckSightings, Information, allowance
 
 PART_CHANGE = 1e-3
 """Prior standard deviation of a part's change [rad] or [m]."""

@@ -1,1 +1,0 @@
-"""Whether a calibration still holds: drift tests on later sightings. Arrays only."""
