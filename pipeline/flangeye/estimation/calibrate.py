@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from flangeye.estimation.answers.answer import (
     predicted_work,
 )
 from flangeye.estimation.answers.corrections import CORRECTED, corrected_part, corrections_of
-from flangeye.estimation.answers.work import Work, work_of
+from flangeye.estimation.answers.work import work_of
 from flangeye.estimation.certify.certified import verdict_of
 from flangeye.estimation.effects.arm import COMMON
 from flangeye.estimation.estimate import Estimate, estimate
@@ -101,7 +102,8 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
     Raises:
         CalibrationRefused: The motion leaves something unknown.
     """
-    found, weak, work = session.found, _weak(session, options), _work(session, options)
+    found, weak = session.found, _weak(session, options)
+    work = work_of(found.problem.where(found.inliers), found.places, options.work)
     left = np.repeat([not (e.of_arm and e.kind in CORRECTED) for e in found.effects], found.counts)
     # A corrected arm no longer has the errors that its correction takes: only the others displace
     # what it reports
@@ -159,7 +161,8 @@ def calibrate_at(
         CalibrationRefused: As of :func:`calibrate`.
     """
     session = session_of(observations, cell, scanner, options.asked)
-    found, weak, work = session.found, _weak(session, options), _work(session, options)
+    found, weak = session.found, _weak(session, options)
+    work = work_of(found.problem.where(found.inliers), found.places, options.work)
     there = found.problem.moves(found.places, places)
     answer = _reported(session, as_reported(found, work).at(there), weak)
     pairs = _pairs(session, answer)
@@ -231,11 +234,6 @@ def _weak(session: Session, options: Options) -> Floats:
     )
 
 
-def _work(session: Session, options: Options) -> Work:
-    found = session.found
-    return work_of(found.problem.where(found.inliers), found.places, options.work)
-
-
 def _reported(session: Session, answer: Answer, weak: Floats) -> HandEye:
     """Return the answer for the arms as their controllers report them."""
     camera, *others = _estimates(session, answer, weak)
@@ -266,6 +264,7 @@ def _estimates(session: Session, answer: Answer, weak: Floats) -> list[Transform
     A camera's covariance is about the middle of its sightings, any other's about its own origin.
     """
     problem, found = session.found.problem, session.found
+    agreeing = list(compress(session.observations, found.inliers))
     moved = _without(problem, problem.moved(found.places, answer.mean), weak)
     rounds, out = symmetry_moves(problem, moved), {}
     for i, name in enumerate(problem.unknown):
@@ -274,7 +273,8 @@ def _estimates(session: Session, answer: Answer, weak: Floats) -> list[Transform
         # A turn of a round target is about its own axis.
         free = np.hstack([weak[rows], rounds[rows]])
         own = {cause: share[rows, rows] for cause, share in answer.shares.items()}
-        about = _about(session, transform)
+        seen = [o.feature.centre for o in agreeing if o.camera == transform.child]
+        about = transform.apply(np.mean(seen, axis=0)) if seen else transform.translation
         out[name] = _estimate(transform, answer.covariance[rows, rows], own, about, free)
     order = [n for n in session.cell.unknown_frames if n in out]
     return [out[name] for name in order]
@@ -291,12 +291,6 @@ def _without(problem: Problem, places: Places, weak: Floats) -> Places:
     return problem.moved(places, weak @ steps)
 
 
-def _about(session: Session, transform: Transform) -> Floats:
-    seen = [o.feature.centre for o, kept in zip(session.observations, session.found.inliers,
-            strict=True) if kept and o.camera == transform.child]  # fmt: skip
-    return transform.apply(np.mean(seen, axis=0)) if seen else transform.translation
-
-
 def _estimate(
     transform: Transform,
     covariance: Floats,
@@ -304,14 +298,10 @@ def _estimate(
     about: Floats,
     free: Floats,
 ) -> TransformEstimate:
-    """Return an estimate, its covariance taken about a point instead of the child's origin.
+    """Return an estimate, its covariance taken about a point (3,) in the parent [m].
 
-    Args:
-        transform: The value.
-        covariance: (6, 6), rotation and translation, this at the child's origin.
-        shares: (6, 6) parts of the covariance by cause.
-        about: (3,) point in the parent [m].
-        free: (6, k) unobservable moves, taken like the covariance.
+    The covariance (6, 6), its shares by cause and the unobservable moves ``free`` (6, k) are given
+    at the child's origin.
     """
     shift = adjoint_shift(about - transform.translation)
     sizes = np.linalg.norm(free, axis=0)
@@ -329,8 +319,7 @@ def _estimate(
 
 def _shared(found: Estimate) -> Floats:
     """Return each error common to all features, in its prior standard deviations."""
-    means = [mean for _, mean, _ in found.numbers("shared")]
-    return np.concatenate(means) if means else np.zeros(0)
+    return np.concatenate([np.zeros(0), *(mean for _, mean, _ in found.numbers("shared"))])
 
 
 def _pairs(session: Session, answer: HandEye) -> tuple[Pair, ...]:
@@ -384,7 +373,7 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
         who = Counter((o.camera, o.target) for o in session.observations)
         seen = ", ".join(f"{c} saw {t} {n} times" for (c, t), n in who.items())
         notes.append(f"solved at once: {seen}")
-    agreeing = [o for o, kept in zip(session.observations, found.inliers, strict=True) if kept]
+    agreeing = list(compress(session.observations, found.inliers))
     plates = [o for o in agreeing if isinstance(o.feature, CircleFeature) and o.feature.radii]
     if _sees_flange(cell) and plates and found.problem.seen.ranks.max() == 5:
         camera = found.places[found.problem.ends[0][0]]

@@ -160,10 +160,6 @@ class Problem:
         seen = replace(seen, times=np.searchsorted(times, seen.times))
         return replace(self, frames=frames, carriers=carriers, seen=seen)
 
-    def of_pair(self, k: int) -> Problem:
-        """Return the problem with the sightings of one camera and one target."""
-        return self.where(self.seen.pairs == k)
-
     def without_normals(self, which: Mask) -> Problem:
         """Return the problem with some circles reduced to their centres."""
         projectors = self.seen.projectors.copy()

@@ -54,6 +54,11 @@ class SizePrior:
         """Return the (S,) sizes (standard deviations) at standard normal values (Z,)."""
         return np.asarray(np.exp(self.centre + self.mix @ z))
 
+    @property
+    def median(self) -> Floats:
+        """The (S,) median sizes."""
+        return np.exp(self.centre)
+
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
@@ -380,9 +385,12 @@ def posterior(model: LinearModel, mode: Peak, at_mode: Fit) -> Posterior:
 
 def _drawn(model: LinearModel, mode: Peak, at_mode: Fit) -> list[Fit]:
     """Return the fits at sizes drawn about their mode."""
+    from scipy.special import ndtri
+
     some = model.subsampled()
     # Evenly spread and mirrored, sixteen state the same errors as thirty-two
-    draws = _near_mode(some, mode, at_mode.sizes, _draws(len(mode.z), 16))
+    half = ndtri(spread_evenly(8, len(mode.z)))
+    draws = _near_mode(some, mode, at_mode.sizes, np.concatenate([half, -half]))
     if some is model:
         return [fit(model, model.sizes.at(z)) for z in draws]
     # So many sightings determine the noise's own sizes to a few percent
@@ -437,14 +445,6 @@ def _without(taken: LinearModel, fits: Sequence[Fit]) -> Iterator[Fit]:
     information, right = across @ rows, (across @ errors)[..., 0]
     for k, each in zip(which.ravel(), fits, strict=True):
         yield _solved(taken, each.sizes, each.information - information[k], each.right - right[k])
-
-
-def _draws(count: int, samples: int) -> Floats:
-    """Return (samples, count) standard normal numbers, spread evenly, in mirrored pairs."""
-    from scipy.special import ndtri
-
-    half = ndtri(spread_evenly(samples // 2, count))
-    return np.concatenate([half, -half])
 
 
 def left_out(model: LinearModel, found: Fit) -> tuple[Floats, Floats]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import TypeVar
 
 import numpy as np
@@ -21,8 +22,6 @@ from flangeye.types.geometry import invert, rotation_exp, rotation_log, stack_ro
 NO_MOTION = np.radians(0.5), 1e-3
 """An arm that turns and moves by less than this stands still [rad, m]."""
 
-IN_LINE = 0.1
-"""Points lie on a line when they are no further from it than this share of its length."""
 UNKNOWN_SHARE = 0.1
 """A frame counts as unknown if its share of a weak move is this or more."""
 
@@ -66,12 +65,8 @@ def suggest(
 ) -> tuple[list[Addition], WeakModes]:
     """Return motions, chosen greedily, that make the weak moves observable, and what stays weak.
 
-    Each step chooses the motion that determines the weak moves best.
-
-    Args:
-        information: (P, P) Fisher information so far.
-        limits: (P,) largest standard deviation of each unknown [rad, m].
-        further: (P, P) information that each motion would add.
+    Each step chooses the motion that determines the weak moves best; ``further`` is the information
+    (P, P) that each motion would add. See :func:`weak_moves` for the others.
     """
     chosen: list[Addition] = []
     weak = weak_moves(information, limits)
@@ -108,6 +103,11 @@ class Spread:
     width: float
     farthest: float
     radius: float
+
+    @property
+    def in_line(self) -> bool:
+        """Whether the points are no further from a line than a tenth of its length."""
+        return self.width < 0.1 * self.length
 
 
 def spread_of(points: Floats) -> Spread:
@@ -203,7 +203,12 @@ def unobservable(
             message names the missing motion.
     """
     scale = np.tile(np.repeat(limits, 3), len(problem.unknown))
-    basis = _meaningful(problem, places)
+    # Moves that change what a sighting predicts: left singular vectors beyond the rank span the
+    # orthogonal complement of those that do not
+    nothing = symmetry_moves(problem, places)
+    basis = np.eye(len(scale))
+    if nothing.shape[1]:
+        basis = np.linalg.svd(nothing, full_matrices=True)[0][:, nothing.shape[1] :]
     weak = weak_moves(
         basis.T @ (information * np.outer(scale, scale)) @ basis, np.ones(basis.shape[1])
     )
@@ -221,30 +226,14 @@ def unobservable(
     raise _refusal(problem, places, (information, scale), WeakModes(moves, weak.excess), freedoms)
 
 
-def _meaningful(problem: Problem, places: Places) -> Floats:
-    """Return (P, m) an orthonormal basis of the moves that change what a sighting predicts.
-
-    A round target's turn about its own axis does not.
-    """
-    nothing = symmetry_moves(problem, places)
-    if not nothing.shape[1]:
-        return np.eye(len(nothing))
-    # Left singular vectors beyond the rank span the orthogonal complement
-    return np.asarray(np.linalg.svd(nothing, full_matrices=True)[0][:, nothing.shape[1] :])
-
-
 def _of_what(problem: Problem, weak: Floats) -> str:
-    shares = {
-        (name, kind): float(np.linalg.norm(weak[6 * i + at : 6 * i + at + 3]))
-        for i, name in enumerate(problem.unknown)
-        for at, kind in ((0, "rotation"), (3, "translation"))
-    }
+    # Shares of each unknown's rotation and translation
+    shares = np.linalg.norm(weak.reshape(len(problem.unknown), 2, 3, -1), axis=(2, 3))
     camera, target = problem.ends[0]
-    of_camera = [
-        kind for (name, kind), size in shares.items() if size > UNKNOWN_SHARE and name == camera
-    ]
-    named = camera if of_camera else max(shares, key=lambda key: shares[key])[0]
-    what = " and ".join(of_camera) if of_camera else "part"
+    named, what = problem.unknown[int(shares.max(axis=1).argmax())], "part"
+    for name, own in zip(problem.unknown, shares > UNKNOWN_SHARE, strict=True):
+        if name == camera and own.any():
+            named, what = name, " and ".join(compress(("rotation", "translation"), own))
     names = {camera: "the camera's pose", target: "the target's place"}
     whose = names.get(named, "the second base's pose")
     return f"{what} of {whose} is not observable from these poses"
@@ -265,7 +254,7 @@ def _line_of(problem: Problem, places: Places) -> tuple[str, str]:
     s = problem.seen
     points = s.centres @ places[problem.unknown[0]][:3, :3].T
     spread = spread_of(points)
-    if spread.width < IN_LINE * spread.length:
+    if spread.in_line:
         return (
             f"the {len(points)} centres lie on a line along base {in_base(spread.axis, 2)} within "
             f"{spread.farthest * 1e3:.1f} mm: rotation about that line is not observable",

@@ -58,7 +58,7 @@ def preview(
     # Two Gauss-Newton steps: the second leaves out what the first finds to be an outlier
     for _ in range(2):
         model = model_at(problem, places, effects, agree.astype(float))
-        found = fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1])))
+        found = fit(model, model.sizes.median)
         places = problem.moved(places, found.mean[: model.p])
         squares, good = judged(model, found)
         agree &= good
@@ -128,8 +128,17 @@ def best_next(
 
     The estimate ``found`` is from the sightings ``seen`` so far.
     """
+    levers, work = [], work_of_frames(found, cell, seen)
+    for i, (name, points) in enumerate(work.items()):
+        block = np.zeros((len(points), 3, len(found.fit.mean)))
+        # A turn w about the frame's origin o moves a point p by w x (p - o), a shift moves all
+        # alike
+        block[:, :, 6 * i : 6 * i + 3] = -hat(points - found.places[name][:3, 3])
+        block[:, :, 6 * i + 3 : 6 * i + 6] = np.eye(3)
+        # The mean over a frame's points: a camera with many sightings counts no more than others
+        levers.append(stack_rows(block) / np.sqrt(len(points)))
     rows, _ = whitened(candidates, found, cell)
-    chosen, _ = most_informative(rows, found.fit.covariance, _levers(found, cell, seen), 1)
+    chosen, _ = most_informative(rows, found.fit.covariance, np.concatenate(levers), 1)
     return int(chosen[0])
 
 
@@ -178,17 +187,3 @@ def whitened(
     # Symmetric roots of the weights; a centre's are singular, so Cholesky would fail
     roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     return roots @ model.design, (roots @ model.residuals[..., None])[..., 0]
-
-
-def _levers(found: Estimate, cell: Cell, seen: Sequence[Observation]) -> Floats:
-    """Return (A, P + K) equally weighted derivatives of all frames' work points."""
-    blocks, work = [], work_of_frames(found, cell, seen)
-    for i, (name, points) in enumerate(work.items()):
-        block = np.zeros((len(points), 3, len(found.fit.mean)))
-        # A turn w about the frame's origin o moves a point p by w x (p - o), a shift moves all
-        # alike
-        block[:, :, 6 * i : 6 * i + 3] = -hat(points - found.places[name][:3, 3])
-        block[:, :, 6 * i + 3 : 6 * i + 6] = np.eye(3)
-        # The mean over a frame's points: a camera with many sightings counts no more than others
-        blocks.append(stack_rows(block) / np.sqrt(len(points)))
-    return np.concatenate(blocks)

@@ -9,7 +9,7 @@ from flangeye.estimation.calibrate import Options, calibrate_at
 from flangeye.estimation.graph import Places, Problem
 from flangeye.estimation.observability import fewest_sightings, require_enough, require_turns
 from flangeye.estimation.start.closed import Motions, motions_of, park_martin, place_of, shah
-from flangeye.estimation.start.loops import loop_of, start_of_circles
+from flangeye.estimation.start.loops import by_name, loop_of, start_of_circles
 from flangeye.estimation.start.sightings import problem_of
 from flangeye.models.cell import Cell, cell_of
 from flangeye.models.configuration import DEFAULT, EVERY, Configuration
@@ -108,9 +108,9 @@ def by_three(
             raise StageError(f"{needed} poses needed, {len(problem.seen)} given")
         # Equation (5) of the paper: X K0 Z^-1 K1 Y^-1 K2 = 1 round the circle is A X B = Y C Z with
         # A = K2, B = K0 and C = K1^-1
-        _, known = loop_of(problem)
+        names, known = loop_of(problem)
         x, y, z = method(known[2], known[0], invert(known[1]))
-        return _as_named(problem, [x, invert(z), invert(y)])
+        return by_name(names, [x, invert(z), invert(y)])
 
     return closed
 
@@ -144,15 +144,8 @@ def _one_arm(problem: Problem) -> tuple[Floats, Floats]:
 
 
 def _placed(problem: Problem, x: Floats, other: Floats) -> Places:
-    return _as_named(problem, [x, invert(other)])
-
-
-def _as_named(problem: Problem, found: Sequence[Floats]) -> Places:
     names, _ = loop_of(problem)
-    return {
-        name: invert(place) if back else place
-        for (name, back), place in zip(names, found, strict=True)
-    }
+    return by_name(names, [x, invert(other)])
 
 
 def _named(name: str, solver: ClosedForm, documentation: str) -> Stage:

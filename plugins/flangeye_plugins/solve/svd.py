@@ -129,7 +129,7 @@ def require_rotation(tcps: Floats, noise: float, limit: float) -> None:
     if not weak:
         return
     spread = spread_of(tcps)
-    if spread.width < 0.1 * spread.length:
+    if spread.in_line:
         raise CalibrationRefused(
             f"the {len(tcps)} flange centres lie on a line along base {in_base(spread.axis, 2)} "
             f"within {spread.farthest * 1e3:.1f} mm: rotation about that line is not observable",

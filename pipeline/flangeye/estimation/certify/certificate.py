@@ -66,22 +66,19 @@ def certify(sightings: LiftedSightings, places: Floats) -> Certificate:
     bare = squares.quadratic / size
     bare[0, 0] -= cost / size
     dual = _Dual.of(bare, squares.families)
+    # The matrix has to vanish along the features of the minimum, and of places with its cost
+    _, sizes, ways = np.linalg.svd(squares.alike(found), full_matrices=False)
+    along = ways[sizes > 1e-6 * sizes[0]]
+    across = np.eye(along.shape[1]) - along.T @ along
     # Most certificates take twenty
-    find_multipliers = dual.find_multipliers(_across(squares.alike(found)), 150)
-    share = dual.missing(find_multipliers)
+    multipliers = dual.find_multipliers(across, 150)
+    share = dual.missing(multipliers)
     if share <= GAP:
         return Certificate(places @ found, cost, share * size, True)
-    elsewhere = _elsewhere(squares, dual.lacks(find_multipliers), len(places))
+    elsewhere = _elsewhere(squares, dual.lacks(multipliers), len(places))
     lower = squares.cost(elsewhere) < cost - GAP * size
     better = places @ elsewhere if lower else None
     return Certificate(places @ found, cost, share * size, False, better)
-
-
-def _across(features: Floats) -> Floats:
-    """Return the (n, n) projector onto the complement of (m, n) features."""
-    _, sizes, ways = np.linalg.svd(features, full_matrices=False)
-    along = ways[sizes > 1e-6 * sizes[0]]
-    return np.asarray(np.eye(features.shape[1]) - along.T @ along)
 
 
 def _elsewhere(squares: Quadratic, lack: Floats, count: int) -> Floats:
@@ -162,10 +159,7 @@ class _Dual(NamedTuple):
     def find_multipliers(self, still: Floats, tries: int, start: Floats | None = None) -> Floats:
         """Return dual multipliers whose matrix is positive semidefinite, or nearly so.
 
-        Args:
-            still: (n, n) projector across the directions in which the matrix has to vanish.
-            tries: Largest number of steps.
-            start: Initial multipliers; zero by default.
+        ``still`` is the (n, n) projector across the directions in which the matrix has to vanish.
         """
         from scipy.optimize import minimize
 

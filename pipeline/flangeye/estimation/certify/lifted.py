@@ -252,7 +252,11 @@ def squares_of(sightings: LiftedSightings, places: Floats) -> Quadratic:
         rows, at = np.concatenate([left, -right], axis=2), np.concatenate(columns)
         told = np.einsum("nri,nrs,nsj->ij", rows, weights[of], rows, optimize=True)
         np.add.at(whole, np.ix_(at, at), told)
-    return Quadratic(*_without_shifts(whole, size), families)
+    # The form at the best translations, and their derivatives by the features
+    across = whole[:size, size:]
+    shifts = -np.linalg.pinv(whole[size:, size:], rcond=1e-12, hermitian=True) @ across.T
+    quadratic = whole[:size, :size] + across @ shifts
+    return Quadratic((quadratic + quadratic.T) / 2, shifts, families)
 
 
 def _linear(side: Factors, families: Sequence[Pattern]) -> tuple[Floats, Indices]:
@@ -310,11 +314,3 @@ def _of_entries(s: LiftedSightings, turned: Floats) -> Floats:
     out = np.swapaxes(errors, 1, 2) @ s.weights @ errors
     out[:, :9, :9] += mean[:, None, None] * beyond
     return np.asarray(out)
-
-
-def _without_shifts(whole: Floats, size: int) -> tuple[Floats, Floats]:
-    """Return the quadratic form at the best translations, and their derivatives by the features."""
-    across = whole[:size, size:]
-    shifts = -np.linalg.pinv(whole[size:, size:], rcond=1e-12, hermitian=True) @ across.T
-    quadratic = whole[:size, :size] + across @ shifts
-    return (quadratic + quadratic.T) / 2, shifts

@@ -61,7 +61,7 @@ def arm_effects(problem: Problem, arm: str) -> list[Effect]:
     accuracy = carriers[0].accuracy or ACCURACY
     poses = np.asarray(problem.frames[carriers[0].frame].place)
     effects = []
-    if _joints_of_all_known(problem, arm):
+    if all(map(joints_known, carriers)):
         for kind, (name, ratio) in ARM_ERRORS.items():
             block = partial(_moved, arm, partial(_displaced, kind))
             effects.append(Effect(name, block, ratio * accuracy, QUALITY_SPREAD, arm, True, kind))
@@ -108,7 +108,7 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
     """
     out = []
     for arm, accuracy in {c.arm: c.accuracy or ACCURACY for c in problem.carriers}.items():
-        if _joints_of_all_known(problem, arm):
+        if all(joints_known(c) for c in problem.carriers if c.arm == arm):
             # Of a joint's angle from pose to pose [rad]: an arm that repeats to 0.03
             # mm by ISO 9283 at a reach of a metre has 0.03 mrad
             out.append(Scatter(partial(_joint_noise, arm), 0.1 * accuracy, QUALITY))
@@ -116,12 +116,6 @@ def arm_scatters(problem: Problem) -> list[Scatter]:
             for rows, ratio in zip((slice(3), slice(3, 6)), ANEW["each"], strict=True):
                 out.append(Scatter(partial(_pose_noise, arm, rows), ratio * accuracy, QUALITY))
     return out
-
-
-def _joints_of_all_known(problem: Problem, arm: str) -> bool:
-    """Whether the joint angles of everything that an arm carries are known."""
-    carriers = [c for c in problem.carriers if c.arm == arm]
-    return all(joints_known(c) for c in carriers)
 
 
 def joints_known(carrier: Carrier) -> bool:

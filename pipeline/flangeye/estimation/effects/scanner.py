@@ -9,7 +9,7 @@ volume: that part is where the camera is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -45,13 +45,13 @@ def _distortion(scanner: ScannerModel, seen: Sightings) -> Effect:
     scaled = moves * np.repeat([0.3, 1.0], 3)[:, None]
     _, sizes, ways = np.linalg.svd(stack_rows(scaled), full_matrices=False)
     # Combinations of weights that hardly move a session's targets are left out
-    kept = ways[sizes > 0.05 * sizes[0]].T
-
-    def block(problem: Problem, linear: Linear) -> Floats:
-        s = problem.seen
-        return np.asarray((field.moves(s) * s.by_depth[:, None, None]) @ kept)
-
+    block = partial(_distorted, field, ways[sizes > 0.05 * sizes[0]].T)
     return Effect("scanner distortion", block, 1.0, TIMES, kind="scanner")
+
+
+def _distorted(field: DistortionField, kept: Floats, problem: Problem, linear: Linear) -> Floats:
+    s = problem.seen
+    return np.asarray((field.moves(s) * s.by_depth[:, None, None]) @ kept)
 
 
 def _edges(problem: Problem, linear: Linear) -> Floats:

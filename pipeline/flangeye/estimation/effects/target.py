@@ -36,13 +36,9 @@ def target_effects(problem: Problem) -> list[Effect]:
 
 def wrong_offset(problem: Problem, effects: Sequence[Effect]) -> list[Effect] | None:
     """Return the effects with a circle offset of millimetres; None without a circle."""
-    if not any(effect.kind == "offset" for effect in effects):
-        return None
-    return [
-        # 2 mm, or three times as much or as little, one sigma
-        replace(e, size=2e-3, factor=3.0) if e.kind == "offset" else e
-        for e in effects
-    ]
+    # 2 mm, or three times as much or as little, one sigma
+    wrong = [replace(e, size=2e-3, factor=3.0) if e.kind == "offset" else e for e in effects]
+    return wrong if any(e.kind == "offset" for e in effects) else None
 
 
 def offset_shown_to(problem: Problem, places: Places) -> float:

@@ -16,11 +16,8 @@ def innovations(problem: Problem, model: LinearModel) -> LinearModel:
     A random walk under white noise is predicted by exponential smoothing (Muth 1960): the share
     ``problem.walk`` of each innovation stays. Innovations are independent, and their likelihood is
     that of the sightings. Each step is a turn and a shift about the camera's origin; if the camera
-    is carried, its world drifts, otherwise the camera.
-
-    Args:
-        problem: The estimation problem, with poses of one target in one camera.
-        model: Its model without a drift; an outlier's share of 0 leaves the prediction as it was.
+    is carried, its world drifts, otherwise the camera. An outlier's share of 0 leaves the
+    prediction as it was. The problem has poses of one target in one camera.
     """
     s, stays = problem.seen, np.repeat(problem.walk, 3)[:, None]
     # From the camera's origin to the target's, and back

@@ -112,30 +112,22 @@ def likely(
     # of the errors' sizes alone make odds of one or two thousand
     told, likelier = np.log(20.0), np.log(1e4)
     whole = bool(np.isfinite(pairs.marker).all())
-    plausible = {
-        reading: _odds(standing if inverse else carried, *held)
-        + _odds(carried if inverse else standing, *away)
-        + _seen(reading.of(pairs).marker[:, :3, 3])
-        for inverse, exchanged, remounted in product((False, True), repeat=3)
-        for reading in [_reading(pairs.in_hand, inverse, exchanged, remounted)]
-        if whole or not (reading.exchanged or reading.marker_inverted)
-    }
+    plausible = {}
+    for inverse, exchanged, remounted in product((False, True), repeat=3):
+        turned = inverse != (exchanged and pairs.in_hand)
+        reading = Reading(exchanged, turned, turned != remounted, remounted)
+        if whole or not (reading.exchanged or reading.marker_inverted):
+            near, far = (standing, carried) if inverse else (carried, standing)
+            places = reading.of(pairs).marker[:, :3, 3]
+            plausible[reading] = _odds(near, *held) + _odds(far, *away) + _seen(places)
     top = max(plausible.values())
-    near = [reading for reading, each in plausible.items() if each > top - told]
-    if len(near) == 1 or not whole:
-        return sorted(near, key=lambda reading: -plausible[reading])
-    odds = {
-        r: plausible[r] - cost for r, cost in zip(near, _costs(near, pairs, robot), strict=True)
-    }
-    likely = [reading for reading in near if odds[reading] > max(odds.values()) - likelier]
+    meant = [reading for reading, each in plausible.items() if each > top - told]
+    if len(meant) == 1 or not whole:
+        return sorted(meant, key=lambda reading: -plausible[reading])
+    costs = dict(zip(meant, _costs(meant, pairs, robot), strict=True))
+    odds = {reading: plausible[reading] - cost for reading, cost in costs.items()}
+    likely = [reading for reading in meant if odds[reading] > max(odds.values()) - likelier]
     return sorted(likely, key=lambda reading: -odds[reading])
-
-
-def _reading(in_hand: bool, inverse: bool, exchanged: bool, remounted: bool) -> Reading:
-    """Return the changes to the poses as read that give one of the eight readings."""
-    if exchanged:
-        return Reading(True, inverse != in_hand, inverse != (in_hand != remounted), remounted)
-    return Reading(False, inverse, inverse != remounted, remounted)
 
 
 def _odds(distance: float, median: float, spread: float) -> float:

@@ -20,7 +20,6 @@ from flangeye.estimation.estimate import Estimate, estimate, model_at
 from flangeye.estimation.graph import Carrier, Places, Problem
 from flangeye.estimation.mixed import fit, mode_of
 from flangeye.estimation.observability import (
-    IN_LINE,
     fewest_sightings,
     require_enough,
     require_turns,
@@ -169,8 +168,7 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
     """Return the problem, an initial guess, the mask of sightings that agree with it, and notes."""
     placed = all(problem.frames[target].place is not None for _, target in problem.ends)
     circles = problem.seen.ranks == 5
-    spread = spread_of(problem.seen.centres)
-    in_line = spread.width < IN_LINE * spread.length
+    in_line = spread_of(problem.seen.centres).in_line
     bare = problem.without_normals(circles) if placed and not in_line else problem
     places, squares = initial_guess(bare)
     _require_agreement(bare, places, agreeing(bare, squares))
@@ -215,7 +213,8 @@ def _require_agreement(problem: Problem, places: Places, agree: Mask) -> None:
             "deg only",
             CONFIGURED,
         )
-    sizes = [np.median(distances(problem.of_pair(k), places)) for k in range(len(problem.ends))]
+    squares, pairs = distances(problem, places), problem.seen.pairs
+    sizes = [np.median(squares[pairs == k]) for k in range(len(problem.ends))]
     camera, target = problem.ends[int(np.argmax(sizes))]
     raise CalibrationRefused(
         f"the sightings fit one calibration to {shift * 1e3:.1f} mm and {np.degrees(turn):.1f} "
@@ -296,7 +295,7 @@ def _cost(problem: Problem, places: Places) -> float:
     """Return -2 log of the restricted likelihood at the prior medians of the sizes."""
     effects = [effect for effect in effects_of(problem, None, ModelOptions()) if effect.lasting]
     model = model_at(problem, places, effects, np.ones(len(problem.seen)))
-    return fit(model, model.sizes.at(np.zeros(model.sizes.mix.shape[1]))).cost
+    return fit(model, model.sizes.median).cost
 
 
 # --- mistakes that are put right -----------------------------------------------------------------

@@ -95,28 +95,22 @@ def size_of(problem: Problem) -> float:
     if len(names) != 2:
         return size
     seen, carried = known
+    turns, still = carried[:, :3, :3], np.broadcast_to(-np.eye(3), (n, 3, 3))
+    right = -carried[:, :3, 3]
     largest = 100.0  # factor on a target's size
     for _ in range(SETS):
         rows = rng.choice(n, min(8, n), replace=False)
         with suppress(np.linalg.LinAlgError, CalibrationRefused):
             turn = park_martin(motions_of(carried[rows], seen[rows]))[:3, :3]
-            left, right = _sized_translations(carried, seen, turn)
+            # Of the loop G X M = Z: two unknown translations, and the scale of M's
+            sized = turns @ (seen[:, :3, 3] @ turn.T)[..., None]
+            left = np.concatenate([turns, still, sized], axis=2)
             equations = stack_rows(left[rows]), right[rows].ravel()
             found = np.asarray(np.linalg.lstsq(*equations, rcond=None)[0], dtype=np.float64)
             median = float(np.median(np.linalg.norm(left @ found - right, axis=1)))
             if median < least and 1 / largest < found[-1] < largest:
                 least, size = median, float(found[-1])
     return size
-
-
-def _sized_translations(carried: Floats, seen: Floats, turn: Floats) -> tuple[Floats, Floats]:
-    """Return (N, 3, 7) equations of two unknown translations and the scale, and (N, 3) right sides.
-
-    They belong to the loop ``G X M = Z``, with the translation of M multiplied by the scale.
-    """
-    turns, still = carried[:, :3, :3], np.broadcast_to(-np.eye(3), (len(seen), 3, 3))
-    sized = turns @ (seen[:, :3, 3] @ turn.T)[..., None]
-    return np.concatenate([turns, still, sized], axis=2), -carried[:, :3, 3]
 
 
 # --- from loop to loop ---------------------------------------------------------------------------
@@ -288,10 +282,13 @@ def _of_poses(loop: _Loop, rows: Indices, rng: np.random.Generator) -> dict[str,
     else:
         x, y, z = two_arms((k[2], k[0], invert(k[1])), rng)
         found = [x, invert(z), invert(y)]
-    return {
-        name: invert(place) if back else place
-        for (name, back), place in zip(names, found, strict=True)
-    }
+    return by_name(names, found)
+
+
+def by_name(names: Sequence[tuple[str, bool]], found: Sequence[Floats]) -> dict[str, Floats]:
+    """Return the places of the unknowns along a loop; see :func:`loop_of`."""
+    each = zip(names, found, strict=True)
+    return {name: invert(place) if back else place for (name, back), place in each}
 
 
 def _circle(loop: _Loop) -> tuple[list[tuple[str, bool]], list[Floats]]:
@@ -403,9 +400,13 @@ def _anywhere(problem: Problem, rng: np.random.Generator) -> tuple[Places, Float
     best: tuple[Places, Floats] | None = None
     least, since = np.inf, 0
     for _ in range(60):
-        places: Places = {name: _drawn(rng) for name in problem.unknown}
+        start: dict[str, Floats] = {}
+        for name in problem.unknown:
+            axis = rng.standard_normal(3)
+            turn = rotation_exp(rng.uniform(-np.pi, np.pi) * axis / np.linalg.norm(axis))
+            start[name] = rigid(turn, rng.uniform(-0.5, 0.5, 3))
         with suppress(np.linalg.LinAlgError):
-            places, _ = _descended(problem, places, turns_alone=True)
+            places, _ = _descended(problem, start, turns_alone=True)
             found = _descended(problem, places)
             cost = _cost(problem, found[1])
             # Two of one cost ended in one valley
@@ -423,12 +424,6 @@ def _anywhere(problem: Problem, rng: np.random.Generator) -> tuple[Places, Float
             "spread them, and turn the arm about two axes at least",
         )
     return best
-
-
-def _drawn(rng: np.random.Generator) -> Floats:
-    axis = rng.standard_normal(3)
-    turn = rotation_exp(rng.uniform(-np.pi, np.pi) * axis / np.linalg.norm(axis))
-    return rigid(turn, rng.uniform(-0.5, 0.5, 3))
 
 
 def _descended(

@@ -87,20 +87,17 @@ def _carriers(
     ends = {end for o in observations for end in (o.camera, o.target)}
     used = {frame for end in ends for frame in chain(frames, end)}
     joints, motions = cell.joints(observations), _motions(observations, cell)
-    return [
-        _carrier(frame, cell, joints, rates_of(motions, frame) if motions else None)
-        for frame in cell.measured
-        if frame in used
-    ]
-
-
-def _carrier(frame: str, cell: Cell, joints: Mapping[str, Floats], rates: Floats | None) -> Carrier:
-    link = cell.links.get(frame)
-    arm, number = (link.arm, link.number) if link else (frame, None)
-    mover = cell.movers.get(arm)
-    if not isinstance(mover, RobotModel):
-        return Carrier(frame, arm, rates=rates, axis=isinstance(mover, Axis))
-    return Carrier(frame, arm, Arm(mover), joints.get(arm), mover.joint_accuracy, number, rates)
+    out = []
+    for frame in (each for each in cell.measured if each in used):
+        link = cell.links.get(frame)
+        arm, number = (link.arm, link.number) if link else (frame, None)
+        mover, rates = cell.movers.get(arm), rates_of(motions, frame) if motions else None
+        if isinstance(mover, RobotModel):
+            own, accuracy = joints.get(arm), mover.joint_accuracy
+            out.append(Carrier(frame, arm, Arm(mover), own, accuracy, number, rates))
+        else:
+            out.append(Carrier(frame, arm, rates=rates, axis=isinstance(mover, Axis)))
+    return out
 
 
 def _motions(observations: Sequence[Observation], cell: Cell) -> list[Motion] | None:
