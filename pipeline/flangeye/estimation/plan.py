@@ -27,7 +27,7 @@ from flangeye.estimation.start.loops import agreeing, initial_guess
 from flangeye.estimation.start.sightings import problem_of
 from flangeye.maths.statistics import corners_of
 from flangeye.maths.threads import on_one_thread
-from flangeye.models.cell import Cell, composed
+from flangeye.models.cell import Cell
 from flangeye.types import (
     CAMERA,
     TARGET,
@@ -157,12 +157,10 @@ def predict(moments: Sequence[Observation], places: Places, cell: Cell) -> list[
 
 def predicted_poses(moments: Sequence[Observation], places: Places, cell: Cell) -> Floats:
     """Return (M, 4, 4) camera_T_target at these moments, predicted from the estimate so far."""
-    frames = {
-        name: replace(frame, place=places.get(name, frame.place))
-        for name, frame in cell.graph(moments).items()
-    }
-    camera, target = (composed(frames, end) for end in (moments[0].camera, moments[0].target))
-    return np.broadcast_to(invert(camera) @ target, (len(moments), 4, 4))
+    parents = {name: frame.parent for name, frame in cell.frames.items()}
+    found = {name: Transform(parents[name], name, place) for name, place in places.items()}
+    ends = cell.ends(found, moments)
+    return np.asarray(invert(ends.camera) @ ends.target)
 
 
 def _moved(like: Feature, pose: Floats) -> Feature:

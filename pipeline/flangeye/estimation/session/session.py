@@ -180,15 +180,15 @@ def _begun(problem: Problem) -> tuple[Problem, Places, Mask, tuple[Note, ...]]:
     far = np.radians(10.0)
     if not tilt > far:
         return problem, places, agreeing(bare, squares), ()
+    stand = f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis"
     if tilt < np.pi - far:  # a flange whose z points inwards is no mistake of its poses
         raise CalibrationRefused(
-            f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis: "
-            "the orientations of the poses are wrong, or belong to another tool frame",
+            f"{stand}: the orientations of the poses are wrong, or belong to another tool frame",
             "'flangeye doctor' tries the orders of quaternions and angles",
         )
     note = (
-        f"the measured normals stand {np.degrees(tilt):.0f} deg from the robot's flange axis, so "
-        "they are left out: check the orientation of the poses, and the tool frame they are in"
+        f"{stand}, so they are left out: check the orientation of the poses, and the tool frame "
+        "they are in"
     )
     return bare, places, agreeing(bare, squares), (note,)
 
