@@ -25,7 +25,7 @@ def test_the_foreign_arms_are_those_of_the_catalogue(arm) -> None:
 
 def test_the_gradient_is_that_of_the_cost(found) -> None:
     model = found.posterior.model
-    model = model.weighted(np.arange(16) != 3)
+    model = replace(model, shares=np.arange(16) != 3)
     x = model.sizes.centre + 0.5 * np.random.default_rng(0).standard_normal(len(model.sizes.centre))
     here = fit(model, np.exp(x), with_slopes=True)
     steps = 1e-4 * np.eye(len(x))
@@ -71,9 +71,9 @@ def test_the_most_likely_sizes_are_where_the_cost_is_least(found) -> None:
 def test_leaving_one_out_in_closed_form_is_leaving_it_out(found) -> None:
     model, mode = found.posterior.model, found.posterior.mode
     parts = np.ones(16)
-    everyone = fit(model.weighted(parts), mode.sizes)
+    everyone = fit(replace(model, shares=parts), mode.sizes)
     parts[3] = 0.0
-    others = fit(model.weighted(parts), mode.sizes)
+    others = fit(replace(model, shares=parts), mode.sizes)
     expected = (model.residuals - model.design @ others.mean)[3]
     assert left_out(model, everyone)[0][3] == pytest.approx(expected, rel=1e-5, abs=1e-10)
 
