@@ -215,7 +215,7 @@ def marginal(model: LinearModel, sizes: Floats) -> Floats:
     return np.asarray(whole[:p, :p] - whole[:p, p:] @ np.linalg.solve(effects, whole[p:, :p]))
 
 
-def _with_slopes(model: LinearModel, found: Fit, whitened: tuple[Floats, Floats, Floats]) -> Fit:
+def _with_slopes(model: LinearModel, found: Fit, known: tuple[Floats, Floats, Floats]) -> Fit:
     r"""Return the fit with the derivatives of its cost by the logarithms x of the sizes.
 
     With V the covariance of the residuals, V_i its derivatives, and :math:`P = V^{-1} - V^{-1} G
@@ -227,7 +227,7 @@ def _with_slopes(model: LinearModel, found: Fit, whitened: tuple[Floats, Floats,
 
     In Henderson's terms V_i P y is 2 E delta for an effect E, and V_i R^-1 e for the noise.
     """
-    (whitening, design, left), sizes = whitened, found.sizes
+    (whitening, design, left), sizes = known, found.sizes
     effect, p = model.sizes.effect, model.p
     count, n = len(sizes), len(model.residuals)
     # By the size of each effect
