@@ -334,6 +334,10 @@ class FoundPose(NamedTuple):
         # Refined, a pose may explain more than twice as many rays
         return 0.4 * self.verdict.agree
 
+    def half_as_certain(self) -> FoundPose:
+        """Return the pose with twice its standard deviation, with which a clear one passes too."""
+        return self._replace(weakest=2 * self.weakest)
+
 
 @dataclass(frozen=True, eq=False)
 class BodySearch:
@@ -352,8 +356,8 @@ class BodySearch:
     def everywhere(self) -> list[FoundPose]:
         """Return distinct candidate poses of the body, best first."""
         found = self._searched(self._coarse, 1)
-        # A pose half as certain would pass too, so it is no chance fit beside a pose not yet found
-        if any(self.passes(one._replace(weakest=2 * one.weakest)) for one in found):
+        # One that passes narrowly may be a chance fit beside a pose that is not found yet
+        if any(self.passes(one.half_as_certain()) for one in found):
             return found
         # An edge-on plate shows few ends, and in a coarse scan many poses look alike
         return self._distinct(found + self._searched(self._fine, 2))

@@ -214,8 +214,9 @@ def _misdrawn(
 
     passes, trust = params.passed_by, params.min_trust
     for what, fix, other in _otherwise(body):
-        righted = filter(passes, BodySearch(points, prepared(other), passes).quickly(trust))
-        if found := next(righted, None):
+        tried = BodySearch(points, prepared(other), passes).quickly(trust)
+        # Of several guesses one fits by chance sooner than the mesh itself
+        if found := next((one for one in tried if passes(one.half_as_certain())), None):
             return Rejected(
                 f"{body.name} is {what}: with a corrected mesh it would be found",
                 f"{found.verdict.shown:.0%} of the rays that should hit the corrected mesh do",
