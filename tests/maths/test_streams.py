@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from flangeye.maths.streams import joints_at, later, pose_at, with_joints
+from flangeye.maths.streams import interpolated, joints_at, later, pose_at, with_joints
 from flangeye.models.cell import Axis, Cell
 from flangeye.types import Motion
 from flangeye.types.geometry import rigid
@@ -48,3 +48,10 @@ def test_rails_and_positioners_pass_where_their_values_say() -> None:
     assert {*placed.others} == {"other", "rail"}
     assert pose_at(placed, 0.1, "rail")[:3, 3] == pytest.approx([0.0, 100.1, 0.0])
     assert cell.passing(MOTION).others.keys() == MOTION.others.keys()
+
+
+@pytest.mark.parametrize("at", [[], [-1.0], [-0.2], [0.0101], [0.2], [1.0], [0.15, -0.13, 0.02]])
+def test_poses_between_samples_are_interpolated_and_held_at_the_ends(at: list[float]) -> None:
+    poses = interpolated(TIMES, POSES, np.array(at))
+    assert poses.shape == (len(at), 4, 4)
+    np.testing.assert_allclose(poses[:, 0, 3], np.clip(at, -0.2, 0.2), atol=1e-12)

@@ -66,6 +66,8 @@ def interpolated(times: Floats, poses: Floats, at: Floats) -> Floats:
     """Return the poses (M, 4, 4) at the times ``at`` (M,), the ends held outside the stream."""
     from scipy.spatial.transform import Rotation, Slerp
 
+    if not len(at):
+        return np.zeros((0, 4, 4))
     inside = np.clip(at, times[0], times[-1])
     # Of a long stream the samples about these times alone
     first = max(int(np.searchsorted(times, inside.min())) - 1, 0)
