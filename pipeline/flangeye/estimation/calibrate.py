@@ -93,7 +93,11 @@ def calibrate(
             marker's size is not the configured one.
     """
     session = session_of(observations, cell, scanner, options.asked)
-    return answered(_at_best(session) if options.certify else session, options, method)
+    if not options.certify:
+        return answered(session, options, method)
+    best, verdict = _certified(session)
+    told = answered(best, options, method)
+    return replace(told, notes=(*told.notes, verdict))
 
 
 def answered(session: Session, options: Options, method: str) -> HandEye:
@@ -137,7 +141,7 @@ def answered(session: Session, options: Options, method: str) -> HandEye:
         expected=expected,
         corrected=corrected,
         true=tuple(_estimates(session, as_true(found), weak)),
-        notes=(*session.notes, *_notes(session, weak, options)),
+        notes=(*session.notes, *_notes(session, weak)),
         without=without,
     )
 
@@ -195,18 +199,16 @@ def with_expected_error(
     return calibration
 
 
-def _at_best(session: Session) -> Session:
-    """Return the session at the better answer that the certificate found, if any, with a note."""
-    found = session.found
-    _, start = verdict_of(found)
+def _certified(session: Session) -> tuple[Session, Note]:
+    """Return the session, at a better answer if one was found, and the verdict on it."""
+    found, (verdict, start) = session.found, verdict_of(session.found)
     if start is None:
-        return session
+        return session, verdict
     there = estimate(found.problem, start, found.effects, found.inliers)
     if there.posterior.cost >= found.posterior.cost:
-        return session
-    return replace(session, found=there).noted(
-        "the certificate found a likelier answer than the search; it is used"
-    )
+        return session, verdict
+    moved = "the certificate found a likelier answer than the search; it is used"
+    return replace(session, found=there).noted(moved), verdict_of(there)[0]
 
 
 def _weak(session: Session, options: Options) -> Floats:
@@ -359,7 +361,7 @@ def _sees_flange(cell: Cell) -> bool:
     return camera.parent == BASE and target.parent == FLANGE and at_origin
 
 
-def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
+def _notes(session: Session, weak: Floats) -> list[Note]:
     """Return the notes for the record."""
     found, cell = session.found, session.cell
     turn, shift = _noise_beyond(found)
@@ -384,4 +386,4 @@ def _notes(session: Session, weak: Floats, options: Options) -> list[Note]:
             f"{'s' if weak.shape[1] > 1 else ''} parallel to the only axis about which the arm "
             f"turned"
         )
-    return [*notes, verdict_of(found)[0]] if options.certify else notes
+    return notes
