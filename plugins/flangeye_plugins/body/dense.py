@@ -296,8 +296,9 @@ def _surface(
     at = np.flatnonzero(np.isfinite(met.depth) & (facing > GRAZING))
     at = at[np.abs(away[at]) < reach]  # excludes NaN, next to a step of depth
     # Through the mounting face the scan shows the carrier, which may lie close behind it
-    at = at[~shape.on_carrier(origin + met.depth[at, None] * rays[at], met.normals[at])]
     place = origin + met.depth[at, None] * rays[at]
+    own = ~shape.on_carrier(place, met.normals[at])
+    at, place = at[own], place[own]
     errors = np.column_stack([np.zeros((len(at), FACINGS)), -bent[at]])
     return _equations(place, met.normals[at], -away[at], pose, shape, errors)
 

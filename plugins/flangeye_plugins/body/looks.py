@@ -103,7 +103,6 @@ class Looks(Shape):
     def views(self) -> Floats:
         """Viewing directions (V, 3), from the scanner to the body."""
         # 128 directions, about 20 degrees apart, are enough for occlusions
-        # 128 directions, about 20 degrees apart, are enough for occlusions
         return spread_directions(128)
 
     @cached_property
@@ -304,13 +303,15 @@ def _apart(points: Floats, seen: Mask) -> Indices:
 
 def _turned_here(placed: Floats, facing: Floats) -> Mask:
     """Return the mask (K, N) of points whose face (K, N, 3) is turned to the scanner."""
-    # Of a direction 10 degrees aside, a plate seen edge on has another face in view
+    # The points are those seen from a direction up to 10 degrees aside, from which a plate that is
+    # seen edge on shows another face
     towards = np.einsum("kni,kni->kn", placed, facing)
     return np.asarray(towards < -GRAZING * np.linalg.norm(placed, axis=2))
 
 
 def _mean(worth: Floats, here: Mask) -> Floats:
-    """Return the mean (K,) of what the points here are worth (K, N); a quarter of all at least."""
+    """Return the mean (K,) of the scores (K, N) of the points that a pose shows, ``here``."""
+    # Divided by a quarter of all points at least: a few would score high by chance
     count = np.maximum(here.sum(axis=1), here.shape[1] / 4)
     return np.asarray((worth * here).sum(axis=1) / count)
 

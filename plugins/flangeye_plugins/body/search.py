@@ -62,7 +62,7 @@ class BodyVerdict(NamedTuple):
 
     @property
     def framed(self) -> bool:
-        """Whether hardly anything is seen around the body but things before it."""
+        """Whether nearly all that is seen around the body is in front of it."""
         return self.outline > 0 and self.ended + self.crossing < self._least
 
     @property
@@ -173,7 +173,7 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     off = np.einsum("ijk,ijk->ij", normals, scan - surface)
     facing = hit & ~_edges(np.where(hit, depth, np.inf), view.angle)
     facing &= np.einsum("ijk,ijk->ij", normals, rays) < -GRAZING * np.linalg.norm(rays, axis=-1)
-    # At its mounting face the carrier is seen, and nothing behind
+    # In front of the mounting face stands the carrier, and nothing can be seen behind the face
     place = origin + surface.reshape(-1, 3) @ rotation
     due = facing & ~shape.on_carrier(place, met.normals).reshape(facing.shape)
     agree = due & (np.abs(off) < tolerance)
@@ -260,7 +260,7 @@ def candidate_poses(ends: OrientedPoints, view: CoarseImage, looks: Looks, effor
     # Poses are refined by one ICP step before 40 points select the best
     poses = _chunked(poses, partial(looks.settled, view=view, count=16, reach=0.1 * looks.size))
     scores = looks.scores(poses, view, 40, 0.05)
-    # Many alike lie a face on a table; a thin body's own pose would not be among the best
+    # Hundreds of nearly equal poses lay a face on a table, and would crowd out a thin body's own
     return poses[distinct(poses, scores, looks, int(200 * effort))].astype(np.float64)
 
 
@@ -335,7 +335,7 @@ class FoundPose(NamedTuple):
         return 0.4 * self.verdict.agree
 
     def half_as_certain(self) -> FoundPose:
-        """Return the pose with twice its standard deviation, with which a clear one passes too."""
+        """Return the pose with twice its standard deviation; one that still passes is clear."""
         return self._replace(weakest=2 * self.weakest)
 
 

