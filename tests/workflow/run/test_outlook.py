@@ -46,6 +46,28 @@ def test_it_says_of_every_pose_what_the_solver_would(run: Path) -> None:
         assert found.residuals[name] == pytest.approx(np.linalg.norm(pair.residual), rel=1e-6)
 
 
+SOLVERS = {
+    "solve.robust": "{required: 5 mm}",
+    "solve.iterative": "{reserve: 3, pool: 5, error: holdout, cost: work_radius, required: 0 mm}",
+}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_solver_that_may_stop_early_is_asked_about_every_pose(
+    tmp_path: Path, solver: str
+) -> None:
+    registry, folder = load_registry(), RunFolder.create("all", tmp_path / "run")
+    step = "solve.robust: {required: 5 mm}"
+    every = parse_recipe(RECIPE.replace(step, "solve.robust"), "small", registry)
+    record_run(every, registry, folder, Start(), report=False)
+    seen = read_run(folder.path).observations()
+    assert len(seen) == 12
+    enough = parse_recipe(RECIPE.replace(step, f"{solver}: {SOLVERS[solver]}"), "small", registry)
+    found = outlook(enough, registry, seen, t.Source(fingerprint=""))
+    assert found.missing == ""
+    assert set(found.residuals) | set(found.set_aside) == {o.id for o in seen}
+
+
 def test_the_error_is_that_to_expect_at_the_work(run: Path) -> None:
     log = read_run(run)
     found, calibration = outlook_of_log(log, load_registry()), log.calibration()

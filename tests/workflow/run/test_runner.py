@@ -233,6 +233,15 @@ def test_weld_runs_only_after_verification(execute: Callable[..., Any]) -> None:
     assert refused.of_kind("weld") == []
 
 
+def test_a_calibration_that_nothing_has_verified_is_given_as_such(
+    execute: Callable[..., Any],
+) -> None:
+    result, log = execute(TOY_RECIPE.partition("  - verify.toy")[0])
+    assert result.status == "unverified"
+    calibration = log.calibration()
+    assert calibration is not None and not isinstance(calibration, t.VerifiedHandEye)
+
+
 SEAM_RECIPE = TOY_RECIPE + "  - scan.toy\n  - seam.toy\n  - weld.toy\n"
 
 

@@ -77,7 +77,7 @@ def outlook(
         source: Provenance of the observations.
     """
     # The truth of a simulation is no business of the solver's.
-    runner = Runner(_of_all(recipe), registry, t.ArchivePath())
+    runner = Runner(recipe, registry, t.ArchivePath())
     try:
         found = runner.solve(seen, replace(source, truth=None))
     except FlangeyeError as error:
@@ -86,17 +86,6 @@ def outlook(
     aside = {p.observation.id: p.reason or "not used" for p in found.pairs if not p.used}
     worth = found.expected.p95 if found.expected else None
     return Outlook(used, aside, worth, "", _coverage(recipe, seen, source))
-
-
-def _of_all(recipe: Recipe) -> Recipe:
-    """Return the recipe with a solver that does not stop before the last pose."""
-    steps = [
-        replace(step, params=step.params.model_copy(update={"required": None}))
-        if step.stage.kind == "solve" and getattr(step.params, "required", None) and step.params
-        else step
-        for step in recipe.steps
-    ]
-    return replace(recipe, steps=tuple(steps))
 
 
 def _coverage(recipe: Recipe, seen: Sequence[t.Observation], source: t.Source) -> Coverage | None:
