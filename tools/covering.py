@@ -30,7 +30,8 @@ class Covering:
     """
 
     def __init__(self, source: Path) -> None:
-        self._coverage = coverage.Coverage(data_file=None, source=[str(source)], config_file=False)
+        sources = [str(source), f"{source}/*"]
+        self._coverage = coverage.Coverage(data_file=None, include=sources, config_file=False)
         self.seconds: dict[str, float] = {}
         self.clock = time.process_time
         self._failed: set[str] = set()

@@ -39,6 +39,7 @@ from tools.covering import NAMED
 ROOT = Path(__file__).parents[1]
 ROOMS: dict[str, tuple[str, ...]] = {
     "motion": ("pipeline/flangeye/motion", "tests/motion", "tests/plugins/arc"),
+    "arc": ("plugins/flangeye_plugins/arc.py", "tests/plugins/arc"),
     "estimator": (
         "pipeline/flangeye/estimation", "tests/estimation",
         "tests/workflow/doctor/monitor/test_attribution.py",
@@ -55,6 +56,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "tests/plugins/refine/test_arm.py",
     ),
     "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot", "tests/plugins/ros2"),
+    "scanner": ("plugins/flangeye_plugins/scanner", "tests/plugins/scanner"),
     "weld": ("plugins/flangeye_plugins/weld", "tests/plugins/weld"),
     "run": (
         "pipeline/flangeye/workflow/run", "tests/workflow/run", "tests/plugins/reader/test_cell.py",
@@ -111,7 +113,7 @@ class Mutation(NamedTuple):
 
 def mutations(room: str) -> Iterator[Mutation]:
     """Yield every change of a room's source."""
-    for path in sorted((ROOT / ROOMS[room][0]).rglob("*.py")):
+    for path in _files(ROOT / ROOMS[room][0], "*.py"):
         source, file = path.read_text("utf-8"), str(path.relative_to(ROOT))
         tree = ast.parse(source)
         lines, later, same = _statements(tree), _in_functions(tree), _free_sizes(tree)
@@ -242,7 +244,7 @@ class Copy:
         """Return a room's fast tests; earlier results for a file are reused."""
         found, (source, *places) = Tests(), ROOMS[room]
         KEPT.mkdir(parents=True, exist_ok=True)
-        files = [file for place in places for file in _test_files(ROOT / place)]
+        files = [file for place in places for file in _files(ROOT / place, "test_*.py")]
         kept = {
             str(file.relative_to(ROOT)): KEPT / f"{room}-{file.stem}-{_digest(file)}.json"
             for file in files
@@ -387,7 +389,7 @@ def _killed_anew(copy: Copy, mutation: Mutation, tests: Tests, budget: float) ->
 
 def _others(room: str, named: list[str]) -> list[str]:
     """Return the room's files of tests beside those that are named; none where none is named."""
-    files = [file for place in ROOMS[room][1:] for file in _test_files(ROOT / place)]
+    files = [file for place in ROOMS[room][1:] for file in _files(ROOT / place, "test_*.py")]
     every = [str(file.relative_to(ROOT)) for file in files]
     return [file for file in every if file not in named] if named else []
 
@@ -405,8 +407,8 @@ def _idle() -> float:
     return IDLE * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
-def _test_files(place: Path) -> list[Path]:
-    return sorted(place.rglob("test_*.py")) if place.is_dir() else [place]
+def _files(place: Path, pattern: str) -> list[Path]:
+    return sorted(place.rglob(pattern)) if place.is_dir() else [place]
 
 
 def _digest(path: Path) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import socket
+import struct
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from flangeye.devices import DeviceError, RobotDriver
 from flangeye.models.arc import ArcTimes
@@ -235,6 +238,74 @@ class TestOutputs:
             pytest.raises(DeviceError, match="refuses RTDE's I; another"),
         ):
             arc_ur_digital.function(params)
+
+
+@pytest.mark.parametrize("at", ["output", "gas", "established"])
+def test_outputs_and_inputs_are_the_eight_that_a_controller_has(at: str) -> None:
+    given = {"host": "a", "output": 3}
+    for number in (0, 7):
+        assert getattr(UrDigitalParams.model_validate({**given, at: number}), at) == number
+    for number in (-1, 8):
+        with pytest.raises(ValidationError, match=at):
+            UrDigitalParams.model_validate({**given, at: number})
+
+
+AGREED = {"V": b"\1", "O": b"\1UINT64", "I": b"\5UINT8,UINT8", "S": b"\1"}
+"""RTDE's answers of a controller that agrees to everything; 5 is the number of the outputs."""
+
+
+class Scripted(threading.Thread):
+    """The RTDE of a controller that gives the answers that it is told to.
+
+    Attributes:
+        params: Of a power source on it.
+        asked: Letter and body of what it was sent so far.
+    """
+
+    def __init__(self, said: Mapping[str, bytes]) -> None:
+        super().__init__(daemon=True)
+        self.params = UrDigitalParams(host=free_address(), output=3, gas=1, established=0)
+        self.asked: list[tuple[str, bytes]] = []
+        self._said, self._server = said, socket.create_server((self.params.host, 30004))
+        self.start()
+
+    def run(self) -> None:
+        line, _ = self._server.accept()
+        with self._server, line, line.makefile("rb") as sent:
+            while head := sent.read(3):
+                size, kind = int.from_bytes(head[:2], "big"), chr(head[2])
+                self.asked.append((kind, sent.read(size - 3)))
+                if kind in self._said:
+                    answer = self._said[kind]
+                    line.sendall((len(answer) + 3).to_bytes(2, "big") + head[2:] + answer)
+
+
+def test_a_controller_is_asked_for_what_every_generation_has() -> None:
+    controller = Scripted(AGREED)
+    UrDigitalArc(controller.params).close()
+    controller.join(1.0)
+    rate = struct.pack(">d", 125.0)
+    outputs = b"standard_digital_output_mask,standard_digital_output"
+    off = [("U", bytes([5, 1 << 3, 0])), ("U", bytes([5, 1 << 1, 0]))]
+    assert controller.asked == [
+        ("V", b"\0\2"), ("O", rate + b"actual_digital_input_bits"), ("I", outputs), ("S", b""),
+        *off, *off,
+    ]  # fmt: skip
+
+
+def test_a_controller_that_has_sent_no_inputs_has_no_arc() -> None:
+    with UrDigitalArc(Scripted(AGREED).params) as arc:
+        assert arc.burning() is False
+
+
+@pytest.mark.parametrize("refused", [b"", b"\0"])
+@pytest.mark.parametrize("kind", AGREED)
+def test_whatever_a_controller_refuses_is_no_power_source(kind: str, refused: bytes) -> None:
+    controller = Scripted({**AGREED, kind: refused})
+    with pytest.raises(DeviceError, match=f"the controller refuses RTDE's {kind}"):
+        UrDigitalArc(controller.params)
+    controller.join(1.0)
+    assert not controller.is_alive(), "its connection is still open"
 
 
 def test_a_controller_that_says_nothing_is_given_up_on() -> None:
