@@ -111,7 +111,7 @@ def session(
     drawn = [moves(rng, n, tilt) if poses is None else poses for _ in range(2)]
     drawn = drawn[0] if np.ndim(drawn[0]) == 4 else drawn
     first, second = homes[0] @ drawn[0], homes[1] @ drawn[1]
-    if configuration.name == "eye-on-arm":
+    if "link" in configuration.camera + configuration.target:
         joints = HOME + rng.uniform(-tilt, tilt, (n, 6)) if joints is None else joints
         first = Arm(ROBOT).flange(joints)
     x = rigid(rotation(rng), rng.normal(0, 0.05, 3))

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flangeye.types import TARGET, Observation, PoseFeature
+from flangeye.models.configuration import ORIGIN, Configuration
+from flangeye.types import BASE, FLANGE, TARGET, Observation, PoseFeature
 from flangeye.types.geometry import rigid, rotation_exp
 from tests.estimation.cells import (
     CONFIGURATIONS,
@@ -60,6 +61,22 @@ def test_data_as_good_as_exact_give_as_good_an_answer(name: str, feature: str) -
             assert not len(estimate.unobservable)
     assert all(pair.used for pair in found.pairs)
     assert max(np.abs(pair.residual).max() for pair in found.pairs) < 1e-6
+
+
+@pytest.mark.parametrize("stands", [ORIGIN, None])
+def test_a_target_on_a_link_of_the_arm_gives_the_cameras_pose(stands) -> None:
+    """A mesh drawn in link5's frame; its poses follow from the joints, the flange's do not count."""
+    made = session(
+        Configuration("eye-on-base", BASE, "link5", stands), np.random.default_rng(1), noise=EXACT
+    )
+    astray = [
+        replace(o, poses={FLANGE: replace(o.poses[FLANGE], matrix=np.eye(4))})
+        for o in made.observations
+    ]
+    found = solved(replace(made, observations=astray))
+    assert set(found.transforms) == set(made.configuration.unknowns)
+    for unknown, estimate in found.transforms.items():
+        assert np.abs(errors(estimate, made.truth[unknown])).max() < 1e-5
 
 
 def spoilt(o: Observation, rng: np.random.Generator) -> Observation:

@@ -229,7 +229,7 @@ def _unit_of(path: Path, vertices: Floats, unit: FileUnit | None) -> tuple[FileU
     limits = f"a body to look for is {SMALLEST * 1e3:g} mm to {LARGEST:g} m across"
     # glTF by definition (2.0, section 3.4), STEP as it is read
     stated: FileUnit | None = unit or (
-        "m" if path.suffix.lower() in (".glb", *STEP_SUFFIXES) else None
+        "m" if path.suffix.lower() in (".glb", ".gltf", *STEP_SUFFIXES) else None
     )
     if stated in fitting:
         return stated, ""

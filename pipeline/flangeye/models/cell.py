@@ -392,10 +392,10 @@ def cell_of(
         frames |= {BASE2: Frame(BASE), FLANGE2: Frame(BASE2)}
         movers[FLANGE2] = second
     frames[TARGET] = Frame(configuration.target, configuration.place)
-    if configuration.camera.startswith(LINK):
-        frames[configuration.camera] = Frame(BASE)
-        number = int(configuration.camera.removeprefix(LINK))
-        links[configuration.camera] = Link(FLANGE, number)
+    for carrier in (configuration.camera, configuration.target):
+        if carrier.startswith(LINK):
+            frames[carrier] = Frame(BASE)
+            links[carrier] = Link(FLANGE, int(carrier.removeprefix(LINK)))
     return Cell(frames, movers, (CAMERA,), (TARGET,), links)
 
 

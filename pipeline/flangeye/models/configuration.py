@@ -69,7 +69,7 @@ class Configuration:
     @property
     def is_default(self) -> bool:
         """Whether this is a camera beside the robot that looks at the flange's own circle."""
-        return self.name == "eye-on-base" and self.stands == ORIGIN
+        return self.name == "eye-on-base" and self.drawn_in_flange
 
     @property
     def drawn_in_flange(self) -> bool:

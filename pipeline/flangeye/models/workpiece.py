@@ -15,11 +15,13 @@
 """
 
 import io
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +37,7 @@ from flangeye.units import Angle, Length
 
 Vector = tuple[float, float, float]
 
-MESHES = (".stl", ".ply", ".obj", ".glb", ".3mf", ".step", ".stp")
+MESHES = (".stl", ".ply", ".obj", ".glb", ".gltf", ".3mf", ".step", ".stp")
 STEP_SUFFIXES = (".step", ".stp")
 """Surfaces, which ``cascadio`` of the extra ``cad`` cuts into triangles, in metres."""
 
@@ -153,8 +155,7 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
         raise StageError(f"{path}: '{path.suffix}' is not CAD; known: {', '.join(MESHES)}")
     if path.suffix.lower() in (*STEP_SUFFIXES, ".3mf") and find_spec("cascadio") is None:
         raise StageError(f"{path}: STEP and 3MF need: pip install 'flangeye[cad]'")
-    # Largest CAD file [bytes]: five million triangles
-    vertices, triangles = _decoded(path, read_regular(path, 256_000_000))
+    vertices, triangles = _decoded(path, _content(path))
     if triangles.ndim != 2 or not len(triangles):
         raise StageError(f"{path}: holds no triangles; is it a mesh, and is the file complete?")
     if not np.isfinite(vertices).all():
@@ -167,18 +168,37 @@ def read_mesh(path: Path) -> tuple[Floats, NDArray[np.int32]]:
     return vertices, triangles.astype(np.int32)
 
 
+def _content(path: Path) -> bytes:
+    # Largest CAD file [bytes]: five million triangles
+    return read_regular(path, 256_000_000)
+
+
 def _decoded(path: Path, raw: bytes) -> tuple[Floats, NDArray[np.int64]]:
     """Decode without native code: Open3D's reader ends the process at a damaged file."""
     import trimesh
 
     try:
+        gltf = path.suffix.lower() == ".gltf"
+        more: dict[str, Any] = {"resolver": _buffers(path, raw)} if gltf else {}
         mesh: Any = trimesh.load(
-            io.BytesIO(raw), file_type=path.suffix[1:].lower(), process=False, force="mesh"
+            io.BytesIO(raw), file_type=path.suffix[1:].lower(), process=False, force="mesh", **more
         )
         return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    except StageError:  # of a buffer, which it names
+        raise
     except Exception as error:  # damaged bytes can break the decoder in any way
         reason = " ".join(str(error).split())[:80] or type(error).__name__
         raise StageError(f"{path}: is not a mesh, or is damaged: {reason}") from None
+
+
+def _buffers(path: Path, raw: bytes) -> dict[str, bytes]:
+    """Return by URI the buffers that a glTF file has in files of their own, in its folder."""
+    uris = [str(each.get("uri", "data:")) for each in json.loads(raw).get("buffers", [])]
+    outside = [uri for uri in uris if not uri.startswith("data:")]
+    # A recipe from another hand must not read files elsewhere
+    if away := [uri for uri in outside if Path(unquote(uri)).name != unquote(uri)]:
+        raise StageError(f"{path}: its buffer {away[0]} is not a file in its own folder")
+    return {uri: _content(path.parent / unquote(uri)) for uri in outside}
 
 
 def _seam(path: Path, line: SeamLine, scale: float) -> CadSeam:

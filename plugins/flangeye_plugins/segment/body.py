@@ -194,7 +194,8 @@ def _predicted(capture: Capture, configuration: Configuration, earlier: Earlier)
     place = configuration.place
     # Earlier sightings from which the pose is predicted
     recent = earlier.observations[-3:]
-    if place is None or configuration.camera != BASE or not recent:
+    # A link's pose is computed only when the whole session is solved
+    if place is None or configuration.camera != BASE or configuration.target not in capture.poses:
         return np.zeros((0, 4, 4))
     now = capture.poses[configuration.target].matrix @ place
     return np.array([

@@ -414,6 +414,28 @@ def test_a_body_survives_being_carried_with_a_run(tmp_path: Path) -> None:
     assert (again.triangles == GRIPPER.triangles).all()
 
 
+def test_a_gltf_file_is_read_with_its_buffers_which_lie_beside_it(tmp_path: Path) -> None:
+    mesh = trimesh.Trimesh(GRIPPER.vertices, GRIPPER.triangles, process=False)
+    for inside in (True, False):
+        files = trimesh.exchange.gltf.export_gltf(
+            mesh.scene(), embed_buffers=inside, merge_buffers=True
+        )
+        for name, content in files.items():
+            (tmp_path / name).write_bytes(content)
+        body = load_body("model.gltf", None, tmp_path)
+        assert body.size == pytest.approx(GRIPPER.size, rel=1e-6)
+        assert body.note == ""  # glTF is in metres
+    (buffer,) = {*files} - {"model.gltf"}
+    text = (tmp_path / "model.gltf").read_text()
+    (tmp_path / "model.gltf").write_text(text.replace(buffer, f"../{buffer}"))
+    with pytest.raises(RecipeError, match=r"buffer \.\./.* is not a file in its own folder"):
+        load_body("model.gltf", None, tmp_path)
+    (tmp_path / "model.gltf").write_text(text)
+    (tmp_path / buffer).unlink()
+    with pytest.raises(RecipeError, match=f"{buffer}: cannot be read"):
+        load_body("model.gltf", None, tmp_path)
+
+
 RECIPE = "title: T\nrobot: ur5\nscanner: phoxi-m\n{}steps: [acquire.simulated, segment.body, fit.body, solve.robust]\n"
 
 
@@ -422,6 +444,7 @@ RECIPE = "title: T\nrobot: ur5\nscanner: phoxi-m\n{}steps: [acquire.simulated, s
     [
         ("target: gripper\n", "flange", "known"),
         ("target: {body: gripper, at: unknown}\n", "flange", "unknown"),
+        ("target: {body: gripper, at: link5}\n", "link5", "known"),
         (
             "configuration: {name: eye-on-arm, camera: link3}\ntarget: {body: gripper, at: base}\n",
             "base",
@@ -442,7 +465,20 @@ def test_a_recipe_says_where_the_body_is_drawn(sections, target, place) -> None:
     ("sections", "message"),
     [
         ("", "needs a body to look for"),
-        ("target: {body: gripper, at: base}\n", "target: {at: …} is one of them or unknown"),
+        (
+            "target: {body: gripper, at: base}\n",
+            "target: {at: …} is flange, link1, link2, … or unknown, not base; a body on the base "
+            "needs a camera on the arm",
+        ),
+        (
+            "target: {body: gripper, at: link7}\n",
+            "the target is carried by a link, link1 to link6, not by link7; write for example "
+            "at: link3",
+        ),
+        (
+            "target: {body: gripper, at: link5}\n",
+            "acquire.simulated plans poses that show a body on the flange, and this one is on link5",
+        ),
         (
             "configuration: {place: unknown}\ntarget: gripper\n",
             "states a body's place; remove place:",

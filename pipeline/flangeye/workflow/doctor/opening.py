@@ -81,13 +81,17 @@ def in_configuration(
             "is known for the flange's own circle, or use a marker"
         )
     links = seconds = None
-    if LINK in configuration.camera or configuration.other_base:
+    carriers = (configuration.camera, configuration.target)
+    if any(LINK in carrier for carrier in carriers) or configuration.other_base:
         bare = [_bare(session, i, states) for i in range(len(session))]
         frames = cell_of(configuration, robot).graph(bare)
         if configuration.other_base:
             seconds = frames[t.FLANGE2].place
-        else:
+        elif LINK in configuration.camera:
             links = frames[configuration.camera].place
+        else:
+            # The link that carries the target takes the flange's place in every check
+            session = replace(session, poses=np.asarray(frames[configuration.target].place))
     # A place that is to be found is unknown to the checks too; the origin would be a claim
     places = session.places if known is not None else np.full_like(session.places, np.nan)
     return replace(

@@ -213,17 +213,11 @@ def _configuration(header: Header, context: Context) -> Configuration:
     if body := header.target:
         if section.place != "known":
             raise RecipeError("place: target: {at: …} states a body's place; remove place:")
-        if body.at == "unknown":
-            stands = None
-        elif body.at not in targets:
-            raise RecipeError(
-                f"{section.name}: the target is carried by {' or '.join(targets)}; "
-                f"target: {{at: …}} is one of them or unknown, not {body.at}"
-            )
-        else:
-            target = body.at
+        stands = None if body.at == "unknown" else stands
+        target = target if body.at == "unknown" else _carrier_of(body.at, section.name, context)
+        targets = target, *targets
     if LINK in cameras:
-        _require_link(camera, context)
+        _require_link(section.name, camera, "camera", context)
     elif camera not in cameras:
         raise RecipeError(f"{section.name}: the camera is carried by {cameras[0]}, not by {camera}")
     if target not in targets:
@@ -238,17 +232,36 @@ def _stands(place: PlaceChoice) -> tuple[Triple, Triple] | None:
     return ORIGIN if place == "known" else None
 
 
-def _require_link(camera: str, context: Context) -> None:
+def _carrier_of(at: str, configuration: str, context: Context) -> str:
+    """Return the frame that carries a body; a link only where the camera is beside the arm."""
+    targets, links = CARRIERS[configuration][1], ""
+    if configuration == "eye-on-base":
+        if at.startswith(LINK):
+            _require_link(configuration, at, "at", context)
+            return at
+        links = f", {LINK}1, {LINK}2, …"
+    if at not in targets:
+        from_arm = "; a body on the base needs a camera on the arm, as in eye-in-hand"
+        raise RecipeError(
+            f"{configuration}: target: {{at: …}} is {', '.join(targets)}{links} or unknown, not "
+            f"{at}{from_arm if at == t.BASE else ''}"
+        )
+    return at
+
+
+def _require_link(configuration: str, carrier: str, key: str, context: Context) -> None:
     if RobotModel not in context:
         raise RecipeError(
-            "eye-on-arm: a link's pose is computed by the arm's kinematics; name the robot's model"
+            f"{configuration}: a link's pose is computed by the arm's kinematics; name the robot's "
+            "model"
         )
     robot: RobotModel | None = context[RobotModel]
     links = [f"{LINK}{i + 1}" for i in range(len(robot.joints) if robot else 0)]
-    if robot and camera not in links:
+    if robot and carrier not in links:
         raise RecipeError(
-            f"eye-on-arm: the camera is carried by a link, {links[0]} to {links[-1]}, not by "
-            f"{camera}; write for example camera: {links[len(links) // 2 - 1]}"
+            f"{configuration}: the {'target' if key == 'at' else key} is carried by a link, "
+            f"{links[0]} to {links[-1]}, not by {carrier}; write for example {key}: "
+            f"{links[len(links) // 2 - 1]}"
         )
 
 

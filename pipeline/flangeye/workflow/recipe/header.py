@@ -194,16 +194,16 @@ class TargetSection(NamedSection):
     word: ClassVar[str] = "body"
 
     body: str
-    """A mesh beside the recipe (STL, PLY, OBJ, GLB, 3MF, STEP), a bundled body, or robot: the arm's
-    own links at its joint angles, by its URDF's meshes."""
+    """A mesh beside the recipe (STL, PLY, OBJ, glTF, 3MF, STEP), a bundled body, or robot: the
+    arm's own links at its joint angles, by its URDF's meshes."""
     links: dict[int, str] = Field({})
     """robot: meshes in metres, by the number of the joint in whose frame each is drawn (0: the
     base); default: those of the URDF."""
     unit: FileUnit | None = None
     """Unit of the mesh's coordinates; found from its size if not given."""
-    at: Literal["flange", "base", "unknown"] = "flange"
-    """Frame in which the mesh is drawn; unknown: the body is fixed to the arm's flange, and its
-    pose on the flange is estimated."""
+    at: str = "flange"
+    """Frame in which the mesh is drawn: flange, link1, link2, … of the arm, or base; unknown: the
+    body is fixed to the arm's flange, and its pose on the flange is estimated."""
 
 
 PlaceChoice = Literal["known", "unknown"] | PlaceParams

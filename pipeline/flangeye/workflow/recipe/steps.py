@@ -152,7 +152,7 @@ class StepOrder:
             self._need(at, need, _what_for(name))
         if stage and kind == "fit":
             self._circles = t.CircleFeature in stage.gives
-        if stage and kind in ("solve", "refine", "verify"):
+        if stage:
             self._check_configuration(at, stage)
         gives = stage.gives if stage and kind == "acquire" else ()
         # A source of ready-made observations has no captures to segment or to fit
@@ -185,9 +185,11 @@ class StepOrder:
 
     def _check_configuration(self, at: tuple[Hashable, ...], stage: Stage) -> None:
         """Refuse a stage in a configuration that it does not declare to serve."""
-        if self._cell:
+        if self._cell or stage.kind not in ("acquire", "solve", "refine", "verify"):
             return
-        if not self._configuration.is_default:
+        if stage.kind == "acquire":
+            self._check_carried(at, stage)
+        elif not self._configuration.is_default:
             if self._configuration.name in stage.serves:
                 return
             found = ", ".join(self._configuration.unknowns)
@@ -200,6 +202,16 @@ class StepOrder:
         elif not self._circles and not stage.serves:
             self._complain(
                 at, f"{stage.name} takes circles, and the fit gives poses; {_instead(stage.kind)}"
+            )
+
+    def _check_carried(self, at: tuple[Hashable, ...], stage: Stage) -> None:
+        """Refuse a stage that plans poses for a body on the flange where it is elsewhere."""
+        plans = TargetBody in map(bare, stage.needs.values()) and TargetBody in self._have
+        if plans and self._configuration.target != t.FLANGE:
+            self._complain(
+                at,
+                f"{stage.name} plans poses that show a body on the flange, and this one is on "
+                f"{self._configuration.target}; record the scans and use acquire.archive",
             )
 
     def _check_place(self, at: tuple[Hashable, ...], kind: str) -> None:
