@@ -165,8 +165,22 @@ def test_a_mirrored_camera_is_recognised() -> None:
         for o in made.observations
     ]
     told = refusal(replace(made, observations=mirrored), CalibrationRefused)
-    assert told.startswith("what the camera saw fits the poses only when mirrored (")
+    figures = re.match(
+        r"what the camera saw fits the poses only when mirrored \((\S+) mm instead of (\S+) mm\)",
+        told,
+    )
+    assert figures is not None
+    there, here = map(float, figures.groups())
+    # The noise of a place, and that of a rotation at a lever of 0.3 m
+    assert there == pytest.approx(0.4, abs=0.15)
+    assert 0.1 < here / spread(made) < 1.0
     assert told.endswith("flip one axis of the scanner's or the robot's frame")
+
+
+def spread(made):
+    """How far apart the camera saw its targets, rms [mm]."""
+    seen = np.array([o.feature.camera_T_target.translation for o in made.observations])
+    return 1e3 * np.sqrt(seen.var(axis=0).sum())
 
 
 def test_scans_of_other_poses_are_refused() -> None:
@@ -177,6 +191,10 @@ def test_scans_of_other_poses_are_refused() -> None:
         for o, f in zip(made.observations, features[1:] + features[:1], strict=True)
     ]
     told = refusal(replace(made, observations=shuffled))
+    figures = re.match(r"the poses fit one calibration to (\S+) mm and (\S+) deg only; ", told)
+    assert figures is not None
+    assert 0.5 < float(figures[1]) / spread(made) < 1.0
+    assert np.degrees(0.4) < float(figures[2]) < np.degrees(0.8)  # of the tilts, and twice as far
     assert "check that each scan belongs to its robot pose" in told
     assert "(write place: unknown if the target's mounting was not measured)" in told
 

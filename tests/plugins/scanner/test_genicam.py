@@ -207,9 +207,12 @@ def test_a_phoxis_node_map_is_set_and_read_back() -> None:
     assert np.isnan(xyz[1, 1:]).all()
 
 
-def test_a_unit_the_device_keeps_is_believed() -> None:
-    nodes, _, _port = node_map(phoxi(("Meter",)))
-    assert configure(nodes).per_metre == 1
+@pytest.mark.parametrize(
+    ("unit", "metre"), [("Millimeter", 1000.0), ("Meter", 1.0), ("Inch", 1 / 0.0254)]
+)
+def test_a_unit_the_device_keeps_is_believed(unit: str, metre: float) -> None:
+    nodes, _, _port = node_map(phoxi((unit,)))
+    assert configure(nodes).per_metre == pytest.approx(metre, rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,7 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A camera in the real library's place; frames, clouds and infos are the real library's."""
 
     class Camera:
-        unit, closed, lost = api.shared.CoordinateUnit_Millimeter, 0, False
+        unit, closed, refused = api.shared.CoordinateUnit_Millimeter, 0, ""
         addresses = ("10.0.0.7",)
 
         def discover_cameras(self):
@@ -70,28 +71,32 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> Any:
                 found.append(info)
             return found
 
+        def said(self, asked):
+            refused = Camera.refused == asked
+            return Status("Device is\noffline.", -2) if refused else Status()
+
         def connect(self, address, patience):
-            assert address == "10.0.0.7"
-            return Status()
+            assert (address, patience) == ("10.0.0.7", 3000)
+            return self.said("connect")
 
         def get_camera_info(self, info):
             info.model, info.serial_number = "Mech-Eye PRO M", "NEM1"
-            return Status()
+            return self.said("info")
 
         def set_point_cloud_unit(self, unit):
             Camera.unit = unit if Camera.unit is not None else None
-            return Status()
+            return self.said("set unit")
 
         def get_point_cloud_unit(self):
-            return Status(), Camera.unit
+            return self.said("get unit"), Camera.unit
 
         def capture_3d(self, frame, patience):
-            if Camera.lost:
-                return Status("Device is offline.", -2)
+            assert patience == 3000
             cloud = api.UntexturedPointCloud()
             cloud.resize(4, 3)
-            frame.get_untextured_point_cloud = lambda: cloud
-            return Status()
+            there = SimpleNamespace(data=lambda: cloud.data() + np.float32(0.7))
+            frame.get_untextured_point_cloud = lambda: there
+            return self.said("capture")
 
         def disconnect(self):
             Camera.closed += 1
@@ -112,6 +117,7 @@ def test_a_frame_of_the_real_library_becomes_an_organised_cloud(camera: Any) -> 
         scan = scanner.expose()()
     assert scan.cloud.xyz.shape == (3, 4, 3)
     assert scan.cloud.xyz.dtype == np.float32
+    assert (scan.cloud.xyz == np.float32(0.7)).all()
     assert camera.closed == 1
 
 
@@ -121,7 +127,7 @@ def test_what_a_camera_does_not_do_is_said(camera: Any) -> None:
         "scanner.mech_eye: several cameras, give address: 10.0.0.5, 10.0.0.7"
     )
     scanner = scanner_mech_eye(None, MechEyeParams(address="10.0.0.7"))
-    camera.lost = True
+    camera.refused = "capture"
     with pytest.raises(DeviceError) as error:
         scanner.expose()
     assert str(error.value) == "Mech-Eye PRO M NEM1: Device is offline. (error -2)"
@@ -130,3 +136,29 @@ def test_what_a_camera_does_not_do_is_said(camera: Any) -> None:
         "Mech-Eye PRO M NEM1: its points remain in unit None, metres are needed"
     )
     assert camera.closed == 1
+
+
+@pytest.mark.parametrize(
+    ("step", "who", "closed"),
+    [
+        ("connect", "scanner.mech_eye: 10.0.0.7", 0), ("info", "scanner.mech_eye", 1),
+        ("set unit", "Mech-Eye PRO M NEM1", 1), ("get unit", "Mech-Eye PRO M NEM1", 1),
+    ],
+)  # fmt: skip
+def test_a_camera_that_refuses_a_step_of_connecting_is_not_open(
+    camera: Any, step: str, who: str, closed: int
+) -> None:
+    camera.refused = step
+    assert refused(MechEyeParams()) == f"{who}: Device is offline. (error -2)"
+    assert camera.closed == closed
+
+
+def test_a_frame_without_points_is_refused(camera: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def capture(self, frame, patience):
+        frame.get_untextured_point_cloud = lambda: SimpleNamespace(data=lambda: np.zeros((0, 3)))
+        return Status()
+
+    monkeypatch.setattr(camera, "capture_3d", capture)
+    with scanner_mech_eye(None, MechEyeParams()) as scanner, pytest.raises(DeviceError) as error:
+        scanner.expose()()
+    assert str(error.value) == "Mech-Eye PRO M NEM1: a frame without points"
