@@ -36,8 +36,9 @@ class Library:
     def __init__(self) -> None:
         self.code, self.names, self.calls = 0, ["first", "second"], list[Any]()
         self.ends: Any = None
+        self.log: Any = print
         self.RpcClient = lambda: SimpleNamespace(
-            setLogHandler=lambda take: take("level", "text"),
+            setLogHandler=lambda take: setattr(self, "log", take),
             setRequestTimeout=lambda ms: self.calls.append(("timeout", ms)),
             connect=self._connected,
             login=lambda user, password: self.calls.append(("login", user, password)),
@@ -49,6 +50,7 @@ class Library:
 
     def _connected(self, host: str, port: int) -> int:
         self.calls.append(("connect", host, port))
+        self.log("level", "text")
         return self.code
 
     def _interface(self, name: str) -> Any:
@@ -80,8 +82,11 @@ def opened(library: Any) -> AuboClient:
     return AuboClient(library, "aubo-i5", "10.0.0.1", "aubo", "123456")
 
 
-def test_it_connects_logs_in_and_takes_the_first_robot(library: Library) -> None:
+def test_it_connects_logs_in_and_takes_the_first_robot(
+    library: Library, capsys: pytest.CaptureFixture[str]
+) -> None:
     made = opened(library)
+    assert capsys.readouterr().out == ""  # the library's own log goes nowhere
     assert library.calls == [
         ("timeout", 500), ("connect", "10.0.0.1", 30004), ("login", "aubo", "123456"),
         ("robot", "first"),

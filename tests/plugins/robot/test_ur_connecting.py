@@ -32,13 +32,16 @@ class Dashboard(socketserver.StreamRequestHandler):
     """A dashboard server that says what it is told to, ``late`` [s]; of what it is not, nothing."""
 
     says: dict[str, str]
+    asked: list[str]
     late = 0.0
 
     def handle(self) -> None:
         self.wfile.write(b"Connected: Universal Robots Dashboard Server\n")
         for line in self.rfile:
             time.sleep(self.late)
-            if (question := line.decode().strip()) not in self.says:
+            question = line.decode().strip()
+            self.asked.append(question)
+            if question not in self.says:
                 return
             self.wfile.write(self.says[question].encode() + b"\n")
 
@@ -47,6 +50,7 @@ class Dashboard(socketserver.StreamRequestHandler):
 def dashboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     host = free_address()
     monkeypatch.setattr(Dashboard, "says", dict(READY), raising=False)
+    monkeypatch.setattr(Dashboard, "asked", [], raising=False)
     monkeypatch.setattr(Dashboard, "late", 0.0)
     with socketserver.ThreadingTCPServer((host, 29999), Dashboard) as server:
         threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
@@ -103,6 +107,15 @@ def test_a_dashboard_that_hangs_up_is_one_line(dashboard: Any) -> None:
         "ur5e: its dashboard server does not answer (the dashboard server has ended): is the "
         f"controller on, is {dashboard.host} its address, is this computer in its network?"
     )
+
+
+def test_the_last_resort_stops_the_program_and_says_where_nothing_answers(dashboard: Any) -> None:
+    dashboard.handler.says["stop"] = "Stopped"
+    stop(dashboard.host)
+    del dashboard.handler.says["stop"]
+    with pytest.raises(OSError, match="the dashboard server has ended"):
+        stop(dashboard.host)
+    assert dashboard.handler.asked == ["stop", "stop"]
 
 
 def test_a_dashboard_is_waited_for_half_a_second_and_in_the_background_a_whole_one(
