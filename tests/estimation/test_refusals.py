@@ -196,7 +196,7 @@ def test_scans_of_other_poses_are_refused() -> None:
     assert 0.5 < float(figures[1]) / spread(made) < 1.0
     assert np.degrees(0.4) < float(figures[2]) < np.degrees(0.8)  # of the tilts, and twice as far
     assert "check that each scan belongs to its robot pose" in told
-    assert "(write place: unknown if the target's mounting was not measured)" in told
+    assert "(write place: unknown, or for a body target: {at: unknown}, if" in told
 
 
 def test_noise_that_is_not_stated_is_found() -> None:

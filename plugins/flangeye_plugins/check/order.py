@@ -12,7 +12,7 @@ from flangeye import part
 from flangeye.maths.pose_corrections import delayed_by_each, shifted, without_tool
 from flangeye.maths.streams import later, pose_at
 from flangeye.types import Floats, Indices, Mask
-from flangeye.types.geometry import rigid, rotation_exp
+from flangeye.types.geometry import rigid, rotation_exp, rotation_log
 from flangeye.workflow.doctor.diagnosis import (
     Arms,
     Finding,
@@ -361,6 +361,9 @@ def _moved_finding(session: RecordedSession, evidence: Significance, start: int)
 def tool(session: RecordedSession) -> Findings:
     """Find poses of a tool (TCP) instead of the flange: a constant offset and turn."""
     _require_known_place(session)
+    if np.isfinite(session.rotations).any() and session.seconds is None:
+        yield from _elsewhere(session)
+        return
     turn, read = _turned(session)
     known, free = fit(equations_of(read)), fit(equations_of(read).with_free_place())
     offset = read.place[:3, :3] @ (free.unknowns.place[0, 0] - read.places[0])
@@ -403,6 +406,32 @@ def tool(session: RecordedSession) -> Findings:
         offset=[f"{value * 1e3:.2f} mm" for value in offset + 0.0],
     )
     yield evidence._replace(probability=p).finding("tool offset", what, corrected_session)
+
+
+def _elsewhere(session: RecordedSession) -> Findings:
+    """Find a target of whole poses that is elsewhere on its carrier than the recipe has it."""
+    found = fit_of(session)
+    offset = found.unknowns.place[0, 0] - session.places[0]
+    turn = rotation_log(found.unknowns.turn[:1])[0]
+    length, angle = float(np.linalg.norm(offset)), float(np.linalg.norm(turn))
+    covariance = np.linalg.pinv(found.information[0], hermitian=True)
+    of_turn = np.sqrt(np.linalg.eigvalsh(covariance[9:12, 9:12])[-1])
+    aside = length > session.limit and _known(found, offset)
+    turned = angle > max(np.radians(2.0), 10 * of_turn)
+    # Where one calibration does not fit, the place that it gives says nothing
+    misfit = found.misfit()
+    fits = misfit.position < session.limit and (misfit.angle or 0.0) < np.radians(2.0)
+    if not fits or not (aside or turned):
+        return
+    what = (
+        f"the target is always seen {length * 1e3:.1f} mm and turned by {np.degrees(angle):.0f} "
+        "deg from where the recipe has it: its mesh is drawn in another frame, or the poses are "
+        "those of a tool set in the controller"
+    )
+    unknown = replace(session, places=np.full_like(session.places, np.nan), again=None)
+    yield Finding(
+        "target place", what, "target: {at: unknown}", gain=0.0, corrected_session=unknown
+    )
 
 
 def _turned(session: RecordedSession) -> tuple[float, RecordedSession]:

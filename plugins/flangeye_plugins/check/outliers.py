@@ -111,6 +111,15 @@ def scatter(session: RecordedSession) -> Findings:
     # More than verify.holdout lets pass [rad]
     if misfit.angle is None or misfit.angle < np.radians(2.0) or misfit.position > session.limit:
         return
+    if np.isfinite(session.places).all():
+        what = (
+            f"the body's rotations scatter by {np.degrees(misfit.angle):.1f} deg about one "
+            f"calibration, which its positions fit to {misfit.position * 1e3:.2g} mm: it is on "
+            "another part of the arm than the recipe says, or it turns against that part"
+        )
+        fix = "target: {at: …} names what carries the body: flange, link1, link2, …"
+        yield Finding("body rotations", what, fix, gain=0.0)
+        return
     what = (
         f"the markers' rotations scatter by {np.degrees(misfit.angle):.1f} deg about one "
         f"calibration, which their positions fit to {misfit.position * 1e3:.2g} mm: detect the "

@@ -459,6 +459,34 @@ def test_the_poses_of_a_tool_that_is_turned() -> None:
         assert finding.fix == "configuration: {name: eye-on-base, place: unknown}"
 
 
+def test_a_bodys_mesh_that_is_drawn_in_another_frame() -> None:
+    """A target's whole pose shows where it is, which the recipe has elsewhere, or not."""
+    session = session_of("marker")
+    at_origin = replace(session, places=np.zeros((len(session), 3)))
+    found = fit_of(at_origin).unknowns
+    true = rigid(found.turn[0], found.place[0, 0])
+    assert not named(replace(at_origin, place=true))
+    for turn, offset, told in (
+        ([0, 0, 0], [0, 0, 0.05], "50.0 mm and turned by 0 deg"),
+        ([np.pi / 2, 0, 0], [0, 0, 0], "mm and turned by 90 deg"),
+    ):
+        moved = true @ rigid(rotation_exp(np.array(turn)), np.array(offset))
+        finding = only(replace(at_origin, place=moved))
+        assert finding.name == "target place"
+        assert told in finding.what
+        assert finding.fix == "target: {at: unknown}"
+
+
+def test_a_body_on_another_link_than_the_recipe_says() -> None:
+    """It turns against the flange, so that no place there explains it."""
+    session = session_of("marker")
+    about = rotation_exp(np.random.default_rng(0).normal(0, 0.1, (len(session), 3)))
+    turned = replace(session, rotations=session.rotations @ about)
+    finding = only(replace(turned, places=np.zeros((len(session), 3))))
+    assert finding.name == "body rotations"
+    assert "another part of the arm" in finding.what
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_mirrored_scans(axis: int) -> None:
     session, sign = session_of("flange"), np.where(np.arange(3) == axis, -1.0, 1.0)

@@ -38,7 +38,8 @@ from flangeye.types.geometry import rigid
 
 CONFIGURED = (
     "check that each scan belongs to its robot pose, and that the recipe's configuration is the "
-    "cell's (write place: unknown if the target's mounting was not measured)"
+    "cell's (write place: unknown, or for a body target: {at: unknown}, if the target's mounting "
+    "was not measured)"
 )
 """Advice if no single answer fits the poses."""
 
