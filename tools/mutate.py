@@ -56,7 +56,9 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "tests/plugins/refine/test_arm.py",
     ),
     "robot": ("plugins/flangeye_plugins/robot", "tests/plugins/robot", "tests/plugins/ros2"),
-    "scanner": ("plugins/flangeye_plugins/scanner", "tests/plugins/scanner"),
+    "scanner": (
+        "plugins/flangeye_plugins/scanner", "tests/plugins/scanner", "tests/plugins/ros2",
+    ),
     "weld": ("plugins/flangeye_plugins/weld", "tests/plugins/weld"),
     "run": (
         "pipeline/flangeye/workflow/run", "tests/workflow/run", "tests/plugins/reader/test_cell.py",

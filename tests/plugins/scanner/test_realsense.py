@@ -53,10 +53,19 @@ def test_the_end_of_a_recording_is_said(recording: Path) -> None:
     assert str(error.value) == "RealSense cell.db3: the recording has ended"
 
 
-def test_closing_twice_is_safe_and_final(recording: Path) -> None:
+def test_closing_twice_is_safe_and_final(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[bool] = []
+
+    class Pipeline(rs.pipeline):  # type: ignore[misc]
+        def stop(self):
+            stopped.append(True)
+            super().stop()
+
+    monkeypatch.setattr(rs, "pipeline", Pipeline)
     scanner = scanner_realsense(None, RealsenseParams(recording=recording))
     scanner.close()
     scanner.close()
+    assert stopped == [True]
     with pytest.raises(DeviceError) as error:
         scanner.expose()
     assert str(error.value) == "RealSense cell.db3: is closed"

@@ -59,7 +59,7 @@ def later(seconds, action, *arguments):
 
 
 def test_each_new_file_is_a_scan_in_metres_and_old_ones_are_left(
-    folder: Path, tmp_path: Path
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "old.pcd").write_bytes(content(tmp_path, 0.9))
     with watch(folder) as scanner:
@@ -68,6 +68,7 @@ def test_each_new_file_is_a_scan_in_metres_and_old_ones_are_left(
         timer = later(0.3, (folder / "new.pcd").write_bytes, content(tmp_path, 0.1))
         scan = scanner.expose()()
         timer.join()
+    assert capsys.readouterr().err == f"Scan now, and export the cloud into {folder}\n"
     assert mark_of(scan) == pytest.approx(0.1)
     assert scan.cloud.xyz.shape == (4, 5, 3)
     assert scan.cloud.xyz[1, 1, 2] == np.float32(0.7)
