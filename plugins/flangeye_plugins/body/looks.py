@@ -94,7 +94,7 @@ class Looks(Shape):
 
     # Points for it that outweigh one that is seen through, or a face that goes on beyond its
     # end.
-    against: ClassVar[float] = 2.0
+    against: ClassVar[float] = 4.0
 
     # Distance beyond a face's end at which no surface should be seen, as a share of the size
     beyond: ClassVar[float] = 0.05

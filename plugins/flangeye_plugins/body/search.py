@@ -18,7 +18,7 @@ import numpy as np
 
 from flangeye.types import Floats, Indices, Mask, Singles
 from flangeye_plugins.body.dense import fitted
-from flangeye_plugins.body.looks import Looks
+from flangeye_plugins.body.looks import SIMILAR, Looks
 from flangeye_plugins.body.shape import GRAZING, OrientedPoints, Shape, some_of
 from flangeye_plugins.body.view import CoarseImage, view_of
 
@@ -132,9 +132,11 @@ def judged(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> B
     foot = shape.at_foot(((ended - pose[:3, 3]) @ pose[:3, :3]).reshape(-1, 3))
     beside &= ~foot.reshape(beside.shape)
     above = np.einsum("ijk,ijk->ij", normals[row, column], scan - ended)
-    on = np.abs(above) < 2 * tolerance
+    # A background may cross the plane of a face, but it seldom lies along it
+    along = np.einsum("ijk,ijk->ij", normals[row, column], view.normals[compared.window])
+    on = (np.abs(above) < 2 * tolerance) & (along > SIMILAR)
     measured = beside & np.isfinite(scan[..., 2])
-    ended_there = beside & (scan[..., 2] > depth[row, column] + 2 * tolerance)
+    ended_there = beside & ~on & (scan[..., 2] > depth[row, column] + 2 * tolerance)
     crossing = measured & ~ended_there & ~_hides(shape, scan, depth[row, column])
     upon = (against & ~compared.through) | (crossing & (above > 2 * tolerance))
     counts = (due, agree, against, beside & on, measured, ended_there, crossing, beside, upon)
@@ -154,6 +156,7 @@ class _Compared(NamedTuple):
     against: Mask
     through: Mask
     facets: Indices
+    window: tuple[slice, slice]
 
 
 def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -> _Compared | None:
@@ -181,7 +184,7 @@ def _compared(shape: Shape, view: CoarseImage, pose: Floats, tolerance: float) -
     behind = facing & (off < -2 * tolerance)
     # A single ray may be a mixed one, at an edge of the body.
     against, through = (ndimage.binary_opening(seen) for seen in (behind | before, behind))
-    return _Compared(rays, scan, depth, normals, hit, due, agree, against, through, facets)
+    return _Compared(rays, scan, depth, normals, hit, due, agree, against, through, facets, window)
 
 
 def _hides(shape: Shape, scan: Floats, depth: Floats) -> Mask:
@@ -256,10 +259,12 @@ def candidate_poses(ends: OrientedPoints, view: CoarseImage, looks: Looks, effor
     poses = _matched(ends, looks, int(20_000 * effort))
     # Points that are compared, and tolerance as a share of the size
     scores = _chunked(poses, partial(looks.scores, view=view, count=16, tolerance=0.05))
-    poses = poses[_best_of(scores, int(2_000 * effort))]
-    # Poses are refined by one ICP step before 40 points select the best
-    poses = _chunked(poses, partial(looks.settled, view=view, count=16, reach=0.1 * looks.size))
-    scores = looks.scores(poses, view, 40, 0.05)
+    # Poses are refined by a step of ICP each time before more points select the best
+    for most, count, reach, tolerance in ((10_000, 16, 0.1, 0.05), (2_000, 40, 0.08, 0.04)):
+        poses = poses[_best_of(scores, int(most * effort))]
+        settled = partial(looks.settled, view=view, count=count, reach=reach * looks.size)
+        poses = _chunked(poses, settled)
+        scores = _chunked(poses, partial(looks.scores, view=view, count=40, tolerance=tolerance))
     # Hundreds of nearly equal poses lay a face on a table, and would crowd out a thin body's own
     return poses[distinct(poses, scores, looks, int(200 * effort))].astype(np.float64)
 
@@ -356,8 +361,7 @@ class BodySearch:
     def everywhere(self) -> list[FoundPose]:
         """Return distinct candidate poses of the body, best first."""
         found = self._searched(self._coarse, 1)
-        # One that passes narrowly may be a chance fit beside a pose that is not found yet
-        if any(self.passes(one.half_as_certain()) for one in found):
+        if any(map(self.passes, found)):
             return found
         # An edge-on plate shows few ends, and in a coarse scan many poses look alike
         return self._distinct(found + self._searched(self._fine, 2))
@@ -373,12 +377,12 @@ class BodySearch:
         # size, and how many are kept
         for count, reaches, tolerance, left in (
             (40, (0.06, 0.05), 0.03, int(200 * effort)),
-            (160, (0.04, 0.03, 0.02), 0.02, int(40 * effort)),
+            (160, (0.04, 0.03, 0.02), 0.02, int(100 * effort)),
         ):
             poses = self._settled(view, poses, count, reaches)
             scores = self.looks.scores(poses, view, count, tolerance)
             poses = poses[distinct(poses, scores, self.looks, left)]
-        found = self.near(poses, trust=trust)
+        found = self.near(poses, trust=trust, most=int(8 * effort))
         if not found:
             return []
         # Turned by a cube's rotations, the best may explain as much
@@ -393,8 +397,10 @@ class BodySearch:
             poses = self.looks.settled(poses, view, count, reach * self.looks.size)
         return poses
 
-    def near(self, poses: Floats, least: float = 0.0, trust: float = 0.0) -> list[FoundPose]:
-        """Return the best of the poses (K, 4, 4), refined on the scan's points, best first.
+    def near(
+        self, poses: Floats, least: float = 0.0, trust: float = 0.0, most: int = 8
+    ) -> list[FoundPose]:
+        """Return the ``most`` best of the poses (K, 4, 4), refined on the points, best first.
 
         Only those with which at least ``least`` rays agree, and the share ``trust`` of rays may
         agree once they are refined.
@@ -407,7 +413,7 @@ class BodySearch:
         kept = np.flatnonzero((agree >= least) & likely)
         if not len(kept):
             return []
-        kept = kept[distinct(poses[kept], ranks[kept], self.looks, 8)]
+        kept = kept[distinct(poses[kept], ranks[kept], self.looks, most)]
         best, others = self._laid(poses[kept[0]]), kept[1:]
         if best and self.passes(best):
             others = others[agree[others] >= best.rivalled_from]

@@ -283,7 +283,7 @@ def _passes(
         and verdict.agree >= fewest
         and (verdict.bounded or verdict.framed)
         and verdict.goes_on <= goes_on * verdict.beside
-        and found.weakest <= (weakest / 2 if little else weakest)
+        and found.weakest <= (0.75 * weakest if little else weakest)
     )
 
 
