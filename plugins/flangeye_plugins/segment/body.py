@@ -302,10 +302,11 @@ def _why_none(every: list[FoundPose], body: TargetBody) -> Rejected:
     if not every:
         return Rejected(f"nothing of the size of {body.name} is there")
     best = every[0].verdict
+    ends = "" if best.bounded or best.framed else ", and it is not seen to end there"
     return Rejected(
         f"no pose of {body.name} ({body.size * 1e3:.0f} mm across) explains the scan: is it in "
         "view, and are the mesh's unit and handedness right?",
         f"best candidate: {best.shown:.0%} of the rays that should hit it do ({best.agree} rays), "
         f"{best.trusted:.1%} of the rays at and beside it agree, standard deviation of its pose "
-        f"{every[0].weakest * body.size * 1e3:.1f} mm",
+        f"{every[0].weakest * body.size * 1e3:.1f} mm{ends}",
     )
