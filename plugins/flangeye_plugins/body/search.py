@@ -56,9 +56,14 @@ class BodyVerdict(NamedTuple):
     @property
     def bounded(self) -> bool:
         """Whether the body's outline is seen, or nothing is seen around it."""
-        ends = self.ended >= self._least or self.beside < self._least
+        ends = self.ends_seen or self.beside < self._least
         # Its surface may go on where something is fastened to it
         return self.outline > 0 and ends and self.goes_on <= 0.5 * self.beside
+
+    @property
+    def ends_seen(self) -> bool:
+        """Whether the body is seen to end before something farther away."""
+        return self.ended >= self._least
 
     @property
     def framed(self) -> bool:

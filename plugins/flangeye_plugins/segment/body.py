@@ -277,13 +277,15 @@ def _passes(
     fewest = 150
     # So may a small share of its broadest view, as a torch's end, and what is seen through a gap
     little = found.seen < 0.07 or not verdict.bounded
+    # And so may a face of another thing fit half of the body, if no end of it is seen
+    half = not verdict.ends_seen and verdict.shown < 2 * coverage
     return (
         verdict.shown >= coverage
         and verdict.trusted >= trust
         and verdict.agree >= fewest
         and (verdict.bounded or verdict.framed)
         and verdict.goes_on <= goes_on * verdict.beside
-        and found.weakest <= (0.75 * weakest if little else weakest)
+        and found.weakest <= weakest * (0.5 if half else 0.75 if little else 1.0)
     )
 
 

@@ -547,6 +547,11 @@ def test_a_steep_face_that_goes_on_is_no_end_of_a_body() -> None:
     assert trial("ring-plate", 98090).found == []
 
 
+def test_half_of_a_body_without_any_end_is_not_enough() -> None:
+    """A box's face before a void shows half of the plate, which is not there."""
+    assert trial("ring-plate", 101280).found == []
+
+
 def test_a_background_that_crosses_the_plane_of_a_face_is_no_part_of_it() -> None:
     told = trial("ring-plate", 97016)
     assert [np.linalg.norm(off(one, told.pose)[3:]) < 0.3e-3 for one in told.found] == [True]
