@@ -12,7 +12,7 @@ from flangeye.types import Floats, Singles
 from flangeye.types.geometry import invert, rotation_log
 from flangeye_plugins.body.dense import BodyFit, fitted
 from flangeye_plugins.body.looks import Looks
-from flangeye_plugins.body.search import BodySearch, around
+from flangeye_plugins.body.search import BodySearch, FoundPose, around
 
 STAGE = "seam.cad"
 LARGER, FEWEST_OF_PART = 3.0, 300
@@ -32,7 +32,7 @@ class Registered:
         seen: Visible area, as a share of the part's area seen from its broadest side.
         refuted: Share of the surface in view that the scan contradicts, by measuring something
             behind it or a face that continues beyond the part's edge.
-        second: Score of the best pose with a different seam, over the score of this pose.
+        second: Credit of the best pose with a different seam, over the credit of this pose.
     """
 
     fit: BodyFit
@@ -61,10 +61,11 @@ def register(
     least = 0.25
     search = BodySearch(scan, looks, lambda one: one.verdict.score > 0 and one.seen >= least)
     found = [one for one in search.everywhere() if one.verdict.score > 0]
+    found.sort(key=_credit, reverse=True)
     fit = _laid(scan, looks, found[0].pose) if found else None
     if fit is None:
         raise CalibrationRefused(f"{STAGE}: the part is nowhere in the scan", _look(workpiece))
-    best, seen = found[0].verdict.score, found[0].seen
+    best, seen = _credit(found[0]), found[0].seen
     if seen < least:
         raise CalibrationRefused(
             f"{STAGE}: poor fit: {seen:.0%} of the part's broadest side is in the scan, at least "
@@ -88,11 +89,17 @@ def register(
     for other in found[1:]:
         apart = _seam_apart(seam, invert(fit.pose) @ other.pose, looks.size)
         if apart > SAME_SEAM:
-            second = max(other.verdict.score / best, 0.0)
+            second = _credit(other) / best
             if second > 0.97:  # the best pose is at least three percent better
                 _refuse_ambiguous(fit.pose, other.pose, apart, second)
             break
     return Registered(fit, seen, refuted, second)
+
+
+def _credit(found: FoundPose) -> float:
+    """Return a pose's score times the share of the part in view that the scan shows."""
+    # A plate turned over agrees with a scan of its back, and hides what stands on it
+    return found.verdict.score * found.verdict.shown
 
 
 def check_unit(points: Floats, workpiece: Workpiece) -> None:
