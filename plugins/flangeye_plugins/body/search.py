@@ -469,7 +469,7 @@ class BodySearch:
         out = np.zeros(self._fine.xyz.shape[:2], bool)
         compared = _compared(self.looks, self._fine, pose, self._tolerance)
         if compared is not None:
-            out[_window(self.looks, self._fine, pose)] = compared.agree
+            out[compared.window] = compared.agree
         return out
 
     @cached_property
